@@ -1,0 +1,40 @@
+"""g: one action from overlapping chunks (paper, Conservative Value Estimation; weights as in paper/choices.md)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from far_app.types import ActionChunk
+
+
+class Plan:
+    """The chunks that still reach into the future of one attempt, indexed by the tick they were computed from.
+
+    â_t is the uniform mean of every chunk's prediction for tick t: at most H of them.
+    """
+
+    def __init__(self, horizon: int) -> None:
+        self.horizon = horizon
+        self._chunks: dict[int, ActionChunk] = {}
+
+    @property
+    def newest_tick(self) -> int:
+        """Tick of the newest chunk; −1 with none."""
+        return max(self._chunks, default=-1)
+
+    def add(self, chunk: ActionChunk) -> None:
+        self._chunks[chunk.tick] = chunk
+
+    def action(self, tick: int) -> Float[np.ndarray, "A"] | None:
+        """â_t, or None when no chunk reaches tick t: then the arm holds."""
+        self._chunks = {k: c for k, c in self._chunks.items() if tick < k + self.horizon}
+        predictions = [c.actions[tick - k] for k, c in self._chunks.items() if k <= tick]
+        return np.mean(predictions, axis=0) if predictions else None
+
+    def value(self, tick: int) -> float:
+        """V(s_t) when the chunk of this very tick is here, else NaN."""
+        chunk = self._chunks.get(tick)
+        return chunk.value if chunk is not None else math.nan

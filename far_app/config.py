@@ -1,0 +1,147 @@
+"""Settings of the method, frozen, each with its unit and source. The resolved configuration is saved with every run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from far_app.errors import ConfigError
+
+
+def _check(ok: bool, what: str, value: object, limit: str) -> None:
+    if not ok:
+        raise ConfigError(f"{what} is {value}, must be {limit}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttributionConfig:
+    """Which chunks are to blame (paper, Failure Attribution)."""
+
+    rule: Literal["percentile", "threshold", "whole"] = "percentile"
+    """percentile is the paper's; threshold and whole are its ablations."""
+    rho: float = 10.0
+    """ρ, per cent of the attempt's whole chunks (paper, hyperparameter table)."""
+    threshold: float = float("nan")
+    """ΔV below which a chunk is flagged when rule is threshold; a percentile of the demonstrations' own ΔV."""
+
+    def __post_init__(self) -> None:
+        _check(0 < self.rho <= 100, "attribution.rho", self.rho, "in (0, 100]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairsConfig:
+    """Positives for each flagged chunk (paper, Contrastive Sample Construction)."""
+
+    candidates: int = 64
+    """M (paper, hyperparameter table)."""
+    positives: int = 8
+    """K (paper, hyperparameter table)."""
+    d_min: float | Literal["mean"] = "mean"
+    """Smallest L2 distance to the negative; "mean" is the mean over the state's candidates (paper)."""
+    d_max: float = 1.0
+    """Largest L2 distance (paper, hyperparameter table)."""
+    arm_only: bool = True
+    """Leave the gripper dimension out of d(·,·) (one flipped gripper tick alone would add 2.0)."""
+    on_empty: Literal["drop_d_max", "skip"] = "drop_d_max"
+    """What to do with a state whose filtered set is empty; both are counted."""
+    choose: Literal["critic", "random"] = "critic"
+    """TopK by Q, or the paper's random ablation."""
+
+    def __post_init__(self) -> None:
+        _check(self.candidates >= 1, "pairs.candidates", self.candidates, "at least 1")
+        _check(1 <= self.positives <= self.candidates, "pairs.positives", self.positives, f"1 to {self.candidates}")
+        _check(self.d_max > 0, "pairs.d_max", self.d_max, "above 0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FCPAConfig:
+    """The preference update (paper, Failure-Contrastive Preference Adaptation)."""
+
+    objective: Literal["pairwise", "no_positive", "no_negative", "awr"] = "pairwise"
+    beta: float = 0.1
+    """β (paper, hyperparameter table)."""
+    steps: int = 10
+    """Gradient steps (paper, hyperparameter table)."""
+    lr: float = 1e-5
+    """AdamW's step size (paper, hyperparameter table); no weight decay."""
+    draws: int = 2
+    """(k, ε) draws a step, shared by a state's negative and its positives; k stratified."""
+    reduction: Literal["sum", "mean"] = "sum"
+    """Squared error summed over the chunk's entries, as Eq. l_diff reads, or averaged."""
+    guard: Literal["none", "stop", "scale", "bc"] = "none"
+    """none is the paper; stop ends the update when l⁺ on fixed draws has risen by guard_rise; scale shrinks the
+    loser's gradient so that l⁺ cannot rise to first order; bc adds a behaviour-cloning term on demonstrations."""
+    guard_rise: float = 0.05
+    """Relative rise of l⁺ that ends the update when guard is stop or scale."""
+    bc_weight: float = 1.0
+    """Weight of the behaviour-cloning term when guard is bc."""
+    accumulate: bool = True
+    """Start from the trial's adapted weights (paper, Algorithm 1); False restarts from the base with all of the
+    trial's pairs."""
+
+    def __post_init__(self) -> None:
+        _check(self.steps >= 0, "fcpa.steps", self.steps, "at least 0")
+        _check(self.lr > 0, "fcpa.lr", self.lr, "above 0")
+        _check(self.draws >= 1, "fcpa.draws", self.draws, "at least 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PerturbationConfig:
+    """Exploration on retries (paper, Perturbation for Retry Exploration). The gripper is never perturbed."""
+
+    kind: Literal["none", "gaussian", "smoothed"] = "gaussian"
+    """Plain Gaussian in simulation, smoothed on hardware (paper)."""
+    probability: float = 0.5
+    """ε_explore (paper, hyperparameter table)."""
+    adaptive: bool = False
+    """Use 0.3 + 0.1 k at retry k instead of probability (the paper's adaptive ablation)."""
+    sigma: float = 0.1
+    """σ in action units (paper, hyperparameter table)."""
+    alpha: float = 0.3
+    """α, smoothing coefficient (paper, hyperparameter table)."""
+    hold: int = 5
+    """h, ticks for which a smoothed target is kept."""
+    dims: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+    """Perturbed action dimensions; (0, 1, 2) on hardware (paper, Real-world Experiments)."""
+
+    def __post_init__(self) -> None:
+        _check(0 <= self.probability <= 1, "perturbation.probability", self.probability, "in [0, 1]")
+        _check(self.sigma >= 0, "perturbation.sigma", self.sigma, "at least 0")
+        _check(0 <= self.alpha < 1, "perturbation.alpha", self.alpha, "in [0, 1)")
+        _check(all(0 <= d < 6 for d in self.dims), "perturbation.dims", self.dims, "arm dimensions 0 to 5")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RetryConfig:
+    """One method of retrying, whole."""
+
+    attribution: AttributionConfig = field(default_factory=AttributionConfig)
+    pairs: PairsConfig = field(default_factory=PairsConfig)
+    fcpa: FCPAConfig = field(default_factory=FCPAConfig)
+    perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)
+    adaptation_limit: float = 60.0
+    """Seconds after which a retry no longer waits for its adaptation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskConfig:
+    """A task is one entry of data (far_app/tasks.py)."""
+
+    name: str
+    environment: str
+    """robosuite's name."""
+    horizon: int
+    """Policy ticks an attempt may take."""
+    success_ticks: int = 5
+    """Consecutive ticks for which the twin's own check must hold."""
+    max_attempts: int = 5
+    """N (paper: 5 in simulation, 3 on the real arm)."""
+    rate: float = 30.0
+    """Policy ticks a second."""
+    placement: tuple[float, float] = (0.12, 0.12)
+    """Half-width of the objects' start region in x and y, metres."""
+    release: Literal["open", "lower_then_open", "ask"] = "open"
+    """How to let go before homing."""
+    retreat: tuple[float, float, float] = (0.0, 0.0, 0.10)
+    """Retreat before the path home, metres, base frame."""
+    cameras: tuple[str, ...] = ("front", "wrist")

@@ -1,0 +1,196 @@
+"""The seams of the program: robot, camera, policy, critic, method, success detector. At most five methods each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, Attempt, Observation, Outcome, Target
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reset:
+    """Put the scene as the seed says (twin) and the arm at its start pose; on hardware the operator does it."""
+
+    seed: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Home:
+    """Open the hand, retreat, go to the start pose; objects stay where they are."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hold:
+    """Stop moving and keep the pose. A latching hold refuses everything but Resume."""
+
+    reason: str
+    latch: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resume:
+    """Operator only: leave the latch. The next motion starts from the measured pose."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Heartbeat:
+    """The app lives; stands for targets while homing."""
+
+
+Request = Reset | Home | Hold | Resume | Heartbeat
+
+
+@runtime_checkable
+class Robot(Protocol):
+    """An arm with its cameras, real or twin, near or behind a socket."""
+
+    def observe(self) -> Observation:
+        """The newest observation; blocks at most a few ms (never for a new one). Raises RobotError when none came
+        for a second."""
+        ...
+
+    def send(self, target: Target) -> None:
+        """Hand over a target without waiting; its Ack arrives in a later Observation.acks."""
+        ...
+
+    def request(self, request: Request) -> None:
+        """Ask for a change of mode; returns once accepted (≤ 1 s; Reset ≤ 10 s), raises RobotError if refused.
+        Progress shows in Observation.status."""
+        ...
+
+    def close(self) -> None:
+        """Hold the arm and let go of it."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """One picture of one camera."""
+
+    image: np.ndarray
+    """RGB uint8, height × width × 3."""
+    stamp: float
+    """Capture time, monotonic seconds."""
+    seq: int
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """A source of RGB frames."""
+
+    name: str
+    height: int
+    width: int
+
+    def frame(self) -> Frame:
+        """The newest frame; never waits for the next one. Raises RobotError when the camera is lost."""
+        ...
+
+    def close(self) -> None: ...
+
+
+History = tuple[Observation, ...]
+"""The last n_obs observations, oldest first; the first is repeated at an attempt's start."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicySpec:
+    """What a policy needs to see and what it gives; compared with the robot before the first motion."""
+
+    name: str
+    """Preset and task, for people."""
+    task: str
+    horizon: int
+    """H."""
+    n_obs: int
+    action_dim: int
+    cameras: tuple[str, ...]
+    image_size: int
+    """Pixels, square; 0 for policies that see state only."""
+    state_keys: tuple[str, ...]
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Chunks from observation histories. Local network and remote server are one type."""
+
+    spec: PolicySpec
+    version: str
+
+    def plan(
+        self, histories: Sequence[History], ticks: Sequence[int], noise: Float[np.ndarray, "B H A"]
+    ) -> list[ActionChunk]:
+        """One chunk per history, denoised from the given noise; with V(s_t) when a critic is attached.
+        Raises PolicyError on a non-finite result."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanRequest:
+    """What a planner may yield to the driver of a trial, so that many trials share one batch."""
+
+    history: History
+    tick: int
+    noise_key: tuple[int, int, int]
+    """(scene, attempt, tick): diffusion noise is drawn from this key, for every method alike."""
+    policy: Policy
+
+
+@runtime_checkable
+class Planner(Protocol):
+    """Where chunks come from during an attempt: at once (lockstep), a worker thread (real time), a shared batch."""
+
+    def begin(self, policy: Policy) -> None:
+        """A new attempt under this policy; everything older is forgotten."""
+        ...
+
+    def plan(
+        self, history: History, tick: int, noise_key: tuple[int, int, int]
+    ) -> Generator[PlanRequest, ActionChunk, Sequence[ActionChunk]]:
+        """Hand over the tick's observations, return the chunks that became ready since the last call. Never waits
+        in real time."""
+        ...
+
+
+@runtime_checkable
+class Method(Protocol):
+    """How to retry: nr, far, bgr … A trial calls begin once, adapt after each failure that has a retry left."""
+
+    name: str
+    policy: Policy
+    """The policy that acts now; its version changes after an adaptation."""
+
+    def begin(self, scene_seed: int) -> None:
+        """A new trial: the base policy returns, memories are cleared."""
+        ...
+
+    def adapt(
+        self,
+        attempt: Attempt,
+        cancelled: Callable[[], bool],
+        progress: Callable[[AdaptationStep], None],
+    ) -> Adaptation:
+        """Learn from a failed attempt. Runs in a background thread; looks at `cancelled` between batches."""
+        ...
+
+    def perturb(self, attempt_index: int, scene_seed: int) -> Callable[[int], Float[np.ndarray, "A"]]:
+        """δ by tick for one attempt (zeros on the first)."""
+        ...
+
+
+@runtime_checkable
+class SuccessDetector(Protocol):
+    """Says when an attempt is over."""
+
+    def begin(self) -> None:
+        """A new attempt."""
+        ...
+
+    def judge(self, observation: Observation) -> Outcome | None:
+        """Called once a tick; an Outcome ends the attempt."""
+        ...

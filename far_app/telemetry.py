@@ -1,0 +1,186 @@
+"""What the app and the hw server tell the operator page, and what it may answer. Latest wins; drops are counted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from far_app.session_states import Intent, State
+from far_app.types import AdaptationStep, Pose, RobotStatus
+from far_app.wire import register
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class LoopHealth:
+    """How well the 30 Hz loop keeps time (the current session)."""
+
+    hz: float = 0.0
+    """Ticks a second over the last two seconds."""
+    ticks: int = 0
+    late_p50_ms: float = 0.0
+    late_p99_ms: float = 0.0
+    late_max_ms: float = 0.0
+    late_ticks: int = 0
+    """Ticks accepted more than 5 ms late."""
+    overruns: int = 0
+    """Ticks accepted more than 33 ms late."""
+    starved: int = 0
+    """Ticks with no plan left."""
+    plan_age_ticks: float = 0.0
+    """Age of the newest chunk, ticks (recent median)."""
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class TrialRow:
+    """One line of the history table."""
+
+    trial: int
+    scene_seed: int
+    attempts: int
+    success: bool
+    judged_by: str
+    flagged: int
+    """Chunks flagged over the trial."""
+    seconds: float
+    note: str = ""
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class LogLine:
+    stamp: float
+    level: str
+    """"info", "warning" or "error"."""
+    text: str
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class Telemetry:
+    """A snapshot of the app, published at 15 Hz."""
+
+    seq: int
+    stamp: float
+    state: State
+    reason: str = ""
+    """Why (fault text, what the app waits for)."""
+    session: str = ""
+    task: str = ""
+    method: str = ""
+    policy_version: str = ""
+    trial: int = 0
+    """1-based."""
+    trials: int = 0
+    """0 when endless."""
+    attempt: int = 0
+    max_attempts: int = 0
+    scene_seed: int = 0
+    tick: int = 0
+    horizon: int = 0
+    rate: float = 30.0
+    chunk_horizon: int = 8
+    values: Float[np.ndarray, "T"] = field(default_factory=lambda: np.zeros(0))
+    """V(s_t) of the attempt on show, NaN where not computed: the running one, or the failed one while adapting."""
+    value_changes: Float[np.ndarray, "C"] = field(default_factory=lambda: np.zeros(0))
+    """ΔV by chunk, once an attempt has failed."""
+    threshold: float = float("nan")
+    """ΔV at or below which chunks were flagged."""
+    flagged: tuple[int, ...] = ()
+    """Ticks at which flagged chunks begin."""
+    adaptation: tuple[AdaptationStep, ...] = ()
+    """Gradient steps of the running or latest adaptation."""
+    adaptation_status: str = ""
+    """"", "attribution", "candidates", "update", or the Adaptation.status it ended with."""
+    pairs: int = 0
+    homing_progress: float = 0.0
+    countdown: float = 0.0
+    """Seconds until the announced retry; 0 when none is announced."""
+    robot: RobotStatus | None = None
+    joints: Float[np.ndarray, "J"] = field(default_factory=lambda: np.zeros(0))
+    eef: Pose | None = None
+    gripper: float = 0.0
+    action: Float[np.ndarray, "A"] = field(default_factory=lambda: np.zeros(0))
+    chunk_path: Float[np.ndarray, "H 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    """Positions the newest chunk would lead through, metres, base frame."""
+    loop: LoopHealth = field(default_factory=LoopHealth)
+    history: tuple[TrialRow, ...] = ()
+    """Newest last, at most 200."""
+    log: tuple[LogLine, ...] = ()
+    """Newest last, at most 50."""
+    refusal: str = ""
+    """Why the last intent was refused."""
+    allowed: tuple[Intent, ...] = ()
+    """Intents that apply now."""
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class OperatorIntent:
+    """From the page to the app."""
+
+    intent: Intent
+    operator: str = ""
+    stamp: float = 0.0
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class StopRequest:
+    """From the page straight to the hw server's stop socket."""
+
+    source: str
+    stamp: float
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class StopAck:
+    latched: float
+    """Monotonic seconds at which the hw server latched."""
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class BodyMesh:
+    """A visual mesh in its body's frame."""
+
+    body: int
+    """Row of View.body_poses."""
+    vertices: Float[np.ndarray, "V 3"]
+    faces: np.ndarray
+    """int32, F × 3."""
+    rgba: tuple[float, float, float, float]
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class SceneGeometry:
+    """What the 3D view draws; asked for once from the hw server."""
+
+    meshes: tuple[BodyMesh, ...]
+    body_names: tuple[str, ...]
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class GeometryRequest:
+    pass
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """From the hw server to the page, at 15 Hz: operator-size pictures and where every body is."""
+
+    seq: int
+    stamp: float
+    jpegs: Mapping[str, bytes]
+    """Camera name to JPEG at the operator's size."""
+    body_poses: Float[np.ndarray, "B 7"]
+    """Position and xyzw quaternion by body, metres, base frame."""
+    status: RobotStatus

@@ -1,0 +1,209 @@
+"""Failure-Aware Retry: the paper's Algorithm 1, one page.
+
+A trial is a generator. It yields a Tick once a tick, so that whoever drives it (the 30 Hz session, a lockstep
+evaluation, a test) can pace, pause or abort it anywhere; it holds no clock, no thread and no socket of its own.
+
+    for i = 1 … N:
+        execute the policy, collect τ_i                        execute()
+        if Success(τ_i): break
+        flag failure-inducing chunks, build pairs, update      method.adapt, in the background
+        return the robot to its start pose                     go_home()
+        retry with the updated policy and perturbation
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from far_app.aggregation import Plan
+from far_app.config import TaskConfig
+from far_app.motion import ActionScale, TargetIntegrator
+from far_app.protocols import Heartbeat, Home, Method, Planner, PlanRequest, Reset, Robot, SuccessDetector
+from far_app.types import (
+    ACTION_DIM,
+    ActionChunk,
+    Adaptation,
+    Attempt,
+    Judge,
+    Observation,
+    Outcome,
+    RobotMode,
+    Step,
+    Trial,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tick:
+    """Let one tick pass; answered with the tick's absolute deadline, monotonic seconds."""
+
+    phase: str
+    """"attempt" or "homing"."""
+    attempt_index: int
+    step: Step | None = None
+    """The step that the last tick completed, with its acknowledged action and lateness."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttemptStarted:
+    attempt_index: int
+    policy_version: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttemptEnded:
+    """Takes no time; a driver that must wait (fault, countdown) waits here."""
+
+    attempt: Attempt
+    last: bool
+    """No retry follows."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adapted:
+    adaptation: Adaptation
+
+
+Event = Tick | PlanRequest | AttemptStarted | AttemptEnded | Adapted
+TrialEvents = Generator[Event, float | ActionChunk | None, Trial]
+
+
+class RunningAdaptation(Protocol):
+    """An adaptation in the background, as the driver started it."""
+
+    def done(self) -> bool:
+        """Finished, failed, or over its time limit."""
+        ...
+
+    def result(self) -> Adaptation: ...
+
+
+StartAdaptation = Callable[[Method, Attempt], RunningAdaptation]
+"""Runs method.adapt(attempt): in a thread for a session, at once in lockstep."""
+
+
+def trial(
+    scene_seed: int,
+    robot: Robot,
+    planner: Planner,
+    method: Method,
+    detector: SuccessDetector,
+    task: TaskConfig,
+    scale: ActionScale,
+    start_adaptation: StartAdaptation,
+) -> TrialEvents:
+    """Algorithm 1. Returns the trial's attempts and adaptations; afterwards the method holds the base policy again."""
+    attempts: list[Attempt] = []
+    adaptations: list[Adaptation] = []
+    method.begin(scene_seed)
+    robot.request(Reset(seed=scene_seed))
+    yield from go_home(robot, attempt_index=1)
+    for i in range(1, task.max_attempts + 1):
+        yield AttemptStarted(attempt_index=i, policy_version=method.policy.version)
+        attempt = yield from execute(robot, planner, method, detector, task, scale, scene_seed, i)
+        attempts.append(attempt)
+        last = attempt.outcome.success or i == task.max_attempts
+        yield AttemptEnded(attempt=attempt, last=last)
+        if last:
+            break
+        adaptation = start_adaptation(method, attempt)
+        yield from go_home(robot, attempt_index=i + 1, until=adaptation.done)
+        adaptations.append(adaptation.result())
+        yield Adapted(adaptation=adaptations[-1])
+    method.begin(scene_seed)
+    return Trial(scene_seed=scene_seed, attempts=tuple(attempts), adaptations=tuple(adaptations))
+
+
+def execute(
+    robot: Robot,
+    planner: Planner,
+    method: Method,
+    detector: SuccessDetector,
+    task: TaskConfig,
+    scale: ActionScale,
+    scene_seed: int,
+    index: int,
+) -> Generator[Event, float | ActionChunk | None, Attempt]:
+    """One attempt. A tick: observe → judge → chunk → aggregate → perturb → target."""
+    spec = method.policy.spec
+    plan = Plan(horizon=spec.horizon)
+    perturbation = method.perturb(index, scene_seed)
+    history: deque[Observation] = deque(maxlen=spec.n_obs)
+    steps: list[Step] = []
+    step: Step | None = None
+    detector.begin()
+    planner.begin(method.policy)
+    integrator = TargetIntegrator(scale, robot.observe().eef)
+
+    for t in range(task.horizon + 1):
+        deadline = yield Tick(phase="attempt", attempt_index=index, step=steps[-1] if steps else None)
+        observation = robot.observe()
+        if step is not None:
+            steps.append(completed(step, observation, integrator))
+        outcome = detector.judge(observation) or fault(observation)
+        if outcome is not None or t == task.horizon:
+            break
+
+        history.extend([observation] * (spec.n_obs if not history else 1))
+        for chunk in (yield from planner.plan(tuple(history), t, (scene_seed, index, t))):
+            plan.add(chunk)
+        action = plan.action(t)  # â_t = g(chunks)
+        delta = perturbation(t) if action is not None else np.zeros(ACTION_DIM)  # δ_t
+        commanded = np.clip(action + delta, -1.0, 1.0) if action is not None else hold_still(steps)
+        target = integrator.target(commanded, observation.eef, time.monotonic(), float(deadline))
+        robot.send(target)
+        step = Step(
+            tick=t, seq=target.seq, stamp=observation.stamp, deadline=float(deadline), observation=observation,
+            action=action if action is not None else commanded, perturbation=delta, commanded=commanded,
+            sent=np.full(ACTION_DIM, np.nan), chunk_tick=plan.newest_tick, starved=action is None,
+            policy_version=method.policy.version, value=plan.value(t), reward=observation.reward,
+            success=observation.success,
+        )  # fmt: skip
+
+    return Attempt(
+        index=index, scene_seed=scene_seed, steps=tuple(steps), final=observation,
+        outcome=outcome or Outcome(success=False, judged_by=Judge.HORIZON), policy_version=method.policy.version,
+    )  # fmt: skip
+
+
+def go_home(
+    robot: Robot, attempt_index: int, until: Callable[[], bool] = lambda: True
+) -> Generator[Event, float | ActionChunk | None, None]:
+    """Return the arm to its start pose, scene untouched, and wait for `until`. Uses none of the horizon's ticks."""
+    robot.request(Home())
+    while True:
+        yield Tick(phase="homing", attempt_index=attempt_index)
+        robot.request(Heartbeat())
+        status = robot.observe().status
+        if status.mode is RobotMode.LATCHED or (status.at_home and until()):
+            return
+
+
+def completed(step: Step, observation: Observation, integrator: TargetIntegrator) -> Step:
+    """The step with what was sent and how late, once its target is acknowledged."""
+    for ack in observation.acks:
+        executed = integrator.executed(ack)
+        if ack.seq == step.seq:
+            sent = executed if executed is not None else step.sent
+            return replace(step, sent=sent, lateness=ack.accepted - ack.due)
+    return step
+
+
+def fault(observation: Observation) -> Outcome | None:
+    """A latched arm ends the attempt as a failure, with the robot's own words."""
+    if observation.status.mode is not RobotMode.LATCHED:
+        return None
+    return Outcome(success=False, judged_by=Judge.FAULT, note=observation.status.reason)
+
+
+def hold_still(steps: list[Step]) -> np.ndarray:
+    """No plan left: no motion, the gripper as it was."""
+    action = np.zeros(ACTION_DIM)
+    action[6] = steps[-1].commanded[6] if steps else -1.0
+    return action
