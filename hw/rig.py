@@ -1,0 +1,111 @@
+"""One rig, one TOML file: limits, start pose, action scale, cameras."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from far_app.errors import ConfigError
+from far_app.motion import ActionScale
+
+RIGS = Path(__file__).parent / "rigs"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SafetyLimits:
+    """What the safety filter enforces, base frame."""
+
+    box_min: tuple[float, float, float]
+    """Metres."""
+    box_max: tuple[float, float, float]
+    """Metres."""
+    step_translation: float = 0.012
+    """Largest translation of one target beyond the last sent, metres."""
+    step_rotation: float = 0.08
+    """Largest rotation of one target beyond the last sent, radians."""
+    speed: float = 0.36
+    """Metres a second."""
+    rotation_speed: float = 2.4
+    """Radians a second."""
+    acceleration: float = 10.0
+    """Metres a second²."""
+    rotation_acceleration: float = 70.0
+    """Radians a second²."""
+
+    def __post_init__(self) -> None:
+        if any(low >= high for low, high in zip(self.box_min, self.box_max, strict=True)):
+            raise ConfigError(f"safety box_min {self.box_min} must lie below box_max {self.box_max} on every axis")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HomePath:
+    """How fast to go home; where to is the start pose, how to let go is task data."""
+
+    open_seconds: float = 0.5
+    speed: float = 0.25
+    """Metres a second along the path (peak of a smooth profile)."""
+    rotation_speed: float = 1.2
+    """Radians a second, peak."""
+    tolerance_translation: float = 0.01
+    """Metres from the start pose that count as home."""
+    tolerance_rotation: float = 0.05
+    """Radians."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigConfig:
+    """Everything about one rig that is not the task."""
+
+    name: str
+    robot: str
+    """"twin" or "xarm"."""
+    start_position: tuple[float, float, float]
+    """Metres, base frame."""
+    start_quaternion: tuple[float, float, float, float]
+    """xyzw, base frame."""
+    safety: SafetyLimits
+    scale: ActionScale = field(default_factory=ActionScale)
+    home: HomePath = field(default_factory=HomePath)
+    watchdog: float = 0.1
+    """Seconds after the last fresh target until the arm is held."""
+    policy_image: int = 84
+    """Pixels, square."""
+    operator_image: int = 240
+    """Pixels, square."""
+    operator_rate: float = 12.0
+    """Operator pictures a second."""
+
+
+def _build(cls: type, table: dict[str, Any], where: str) -> Any:
+    fields = {f.name: f for f in dataclasses.fields(cls)}
+    unknown = sorted(set(table) - set(fields))
+    if unknown:
+        raise ConfigError(f"{where}: unknown setting {', '.join(unknown)}; known: {', '.join(fields)}")
+    parts = {"safety": SafetyLimits, "scale": ActionScale, "home": HomePath}
+    values = {}
+    for key, value in table.items():
+        if isinstance(value, dict):
+            value = _build(parts[key], value, f"{where}.{key}")
+        values[key] = tuple(value) if isinstance(value, list) else value
+    try:
+        return cls(**values)
+    except TypeError as error:
+        raise ConfigError(f"{where}: {error}") from error
+
+
+def load_rig(name_or_path: str) -> RigConfig:
+    """A rig by name (hw/rigs/NAME.toml) or by path."""
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        path = RIGS / f"{name_or_path}.toml"
+    if not path.exists():
+        known = ", ".join(sorted(p.stem for p in RIGS.glob("*.toml")))
+        raise ConfigError(f"no rig file {path}; known rigs: {known}; or give the path of a TOML file")
+    try:
+        table = tomllib.loads(path.read_text())
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"rig file {path} is not valid TOML: {error}") from error
+    return _build(RigConfig, table, path.name)
