@@ -67,6 +67,8 @@ class RigConfig:
     start_quaternion: tuple[float, float, float, float]
     """xyzw, base frame."""
     safety: SafetyLimits
+    start_joints: tuple[float, ...] = ()
+    """The start pose in joint space, radians (twin: where a scene reset puts the arm)."""
     scale: ActionScale = field(default_factory=ActionScale)
     home: HomePath = field(default_factory=HomePath)
     watchdog: float = 0.1
