@@ -1,7 +1,12 @@
-"""The session's states and transitions: an enum and one table. Pure; the driver in session.py acts on it.
+"""The session's states and transitions: an enum and one table. Pure; far_app/session acts on it.
 
-An operator's intent that does not apply now is refused with a reason; an internal event that does not apply is a bug
-and raises.
+    state' = TABLE[state, event]          event: what the operator asks (Intent) or the program notices (Happening)
+
+An operator's intent that does not apply now is refused with a reason (`refusal`, never an exception); an internal event
+that does not apply is a bug and raises (`step`). The happy path needs no intent:
+
+    READY → HOMING → RUNNING → TRIAL_DONE → HOMING …            success
+                       ↳ ADAPTING → RUNNING …                   failure with an attempt left
 """
 
 from __future__ import annotations
@@ -63,3 +68,105 @@ class Happening(StrEnum):
     FAULT = "fault"
     NO_MORE_TRIALS = "no_more_trials"
     NEED_SCENE = "need_scene"
+    GO_ON_ATTEMPT = "go_on_attempt"
+    """A held attempt goes on."""
+    GO_ON_HOMING = "go_on_homing"
+    """The way home goes on after a hold."""
+    GO_ON_ADAPTING = "go_on_adapting"
+    """The way home goes on after a hold, the adaptation still running."""
+
+
+Event = Intent | Happening
+
+
+class ImpossibleTransition(RuntimeError):
+    """An event that cannot happen in this state: a bug of ours."""
+
+
+def _table() -> dict[tuple[State, Event], State]:
+    s, i, h = State, Intent, Happening
+    table: dict[tuple[State, Event], State] = {
+        # a trial, from start to end, with no button
+        (s.READY, h.BEGIN_TRIAL): s.HOMING,
+        (s.READY, h.NEED_SCENE): s.AWAITING_SCENE,
+        (s.READY, h.NO_MORE_TRIALS): s.FINISHED,
+        (s.HOMING, h.AT_HOME): s.RUNNING,
+        (s.RUNNING, h.SUCCEEDED): s.TRIAL_DONE,
+        (s.RUNNING, h.FAILED_RETRY): s.ADAPTING,
+        (s.RUNNING, h.FAILED_LAST): s.TRIAL_DONE,
+        (s.ADAPTING, h.AT_HOME): s.RUNNING,
+        (s.TRIAL_DONE, h.BEGIN_TRIAL): s.HOMING,
+        (s.TRIAL_DONE, h.NEED_SCENE): s.AWAITING_SCENE,
+        (s.TRIAL_DONE, h.NO_MORE_TRIALS): s.FINISHED,
+        (s.AWAITING_SCENE, i.SCENE_READY): s.READY,
+        # the operator's word on the attempt; what follows is a happening of the same tick
+        (s.RUNNING, i.MARK_SUCCESS): s.RUNNING,
+        (s.RUNNING, i.MARK_FAILURE): s.RUNNING,
+        (s.PAUSED, i.MARK_SUCCESS): s.RUNNING,
+        (s.PAUSED, i.MARK_FAILURE): s.RUNNING,
+        (s.ADAPTING, i.MARK_SUCCESS): s.TRIAL_DONE,  # cancels the adaptation
+        (s.RUNNING, i.SKIP_TRIAL): s.RUNNING,
+        (s.PAUSED, i.SKIP_TRIAL): s.RUNNING,
+        (s.HOMING, i.SKIP_TRIAL): s.TRIAL_DONE,
+        (s.ADAPTING, i.SKIP_TRIAL): s.TRIAL_DONE,
+        # pause, and leaving a pause, a stop or a fault: READY for an instant, then what was interrupted goes on
+        (s.RUNNING, i.PAUSE): s.PAUSED,
+        (s.HOMING, i.PAUSE): s.PAUSED,
+        (s.ADAPTING, i.PAUSE): s.PAUSED,
+        (s.PAUSED, i.RESUME): s.READY,
+        (s.STOPPED, i.RESUME): s.READY,
+        (s.FAULT, i.RESUME): s.READY,
+        (s.READY, h.GO_ON_ATTEMPT): s.RUNNING,
+        (s.READY, h.GO_ON_HOMING): s.HOMING,
+        (s.READY, h.GO_ON_ADAPTING): s.ADAPTING,
+        # an attempt that a stop or a fault ended is accounted for after the operator cleared it
+        (s.READY, h.SUCCEEDED): s.TRIAL_DONE,
+        (s.READY, h.FAILED_RETRY): s.ADAPTING,
+        (s.READY, h.FAILED_LAST): s.TRIAL_DONE,
+    }
+    for state in State:
+        if state is s.FINISHED:
+            continue
+        table[state, i.QUIT] = s.FINISHED
+        table[state, h.FAULT] = s.FAULT
+        if state is not s.FAULT:
+            table[state, i.STOP] = s.STOPPED
+            table[state, h.LATCH] = s.STOPPED
+    table[s.FAULT, i.STOP] = s.FAULT  # a stop is never refused; the fault stays to be cleared
+    table[s.FAULT, h.LATCH] = s.FAULT
+    return table
+
+
+TABLE = _table()
+
+_WHY: dict[Intent, str] = {
+    Intent.STOP: "the session has ended",
+    Intent.PAUSE: "nothing is moving that could be paused",
+    Intent.RESUME: "nothing is paused, stopped or faulty",
+    Intent.MARK_SUCCESS: "no attempt is under way or just failed",
+    Intent.MARK_FAILURE: "no attempt is under way",
+    Intent.SKIP_TRIAL: "no trial is under way that could be skipped",
+    Intent.SCENE_READY: "the app does not wait for a scene",
+    Intent.QUIT: "the session has ended",
+}
+
+
+def step(state: State, event: Event) -> State:
+    """The next state. Raises ImpossibleTransition for a pair the table lacks (ask `refusal` first for an intent)."""
+    try:
+        return TABLE[state, event]
+    except KeyError:
+        raise ImpossibleTransition(f"{type(event).__name__} '{event}' cannot happen in state '{state}'") from None
+
+
+def refusal(state: State, intent: Intent) -> str:
+    """Why an intent does not apply now; empty when it does."""
+    if (state, intent) in TABLE:
+        return ""
+    hint = "; resume first" if state in (State.STOPPED, State.FAULT) else ""
+    return f"'{intent}' is refused in state '{state}': {_WHY[intent]}{hint}"
+
+
+def allowed(state: State) -> tuple[Intent, ...]:
+    """The intents that apply now."""
+    return tuple(intent for intent in Intent if (state, intent) in TABLE)

@@ -50,6 +50,11 @@ class Tick:
     """The step that the last tick completed, with its acknowledged action and lateness."""
 
 
+class AfterHold(float):
+    """The deadline of the first tick after the arm was held (pause, stale observations): plans and histories are
+    forgotten and motion starts from the measured pose."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class AttemptStarted:
     attempt_index: int
@@ -144,6 +149,9 @@ def execute(
     for t in range(task.horizon + 1):
         deadline = yield Tick(phase="attempt", attempt_index=index, step=steps[-1] if steps else None)
         observation = robot.observe()
+        if isinstance(deadline, AfterHold):
+            plan, integrator = Plan(horizon=spec.horizon), TargetIntegrator(scale, observation.eef)
+            history.clear()
         if step is not None:
             steps.append(completed(step, observation, integrator))
         outcome = detector.judge(observation) or fault(observation)
