@@ -13,7 +13,6 @@ evaluation, a test) can pace, pause or abort it anywhere; it holds no clock, no 
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
@@ -41,7 +40,8 @@ from far_app.types import (
 
 @dataclass(frozen=True, kw_only=True)
 class Tick:
-    """Let one tick pass; answered with the tick's absolute deadline, monotonic seconds."""
+    """Let one tick pass; answered with the tick's absolute deadline, seconds on the robot's clock: the machine's
+    monotonic clock in real time, simulated time in lockstep. The tick's target is created, and due, at its deadline."""
 
     phase: str
     """"attempt" or "homing"."""
@@ -149,11 +149,11 @@ def execute(
     for t in range(task.horizon + 1):
         deadline = yield Tick(phase="attempt", attempt_index=index, step=steps[-1] if steps else None)
         observation = robot.observe()
+        if step is not None:
+            steps.append(completed(step, observation, integrator))
         if isinstance(deadline, AfterHold):
             plan, integrator = Plan(horizon=spec.horizon), TargetIntegrator(scale, observation.eef)
             history.clear()
-        if step is not None:
-            steps.append(completed(step, observation, integrator))
         outcome = detector.judge(observation) or fault(observation)
         if outcome is not None or t == task.horizon:
             break
@@ -164,7 +164,7 @@ def execute(
         action = plan.action(t)  # â_t = g(chunks)
         delta = perturbation(t) if action is not None else np.zeros(ACTION_DIM)  # δ_t
         commanded = np.clip(action + delta, -1.0, 1.0) if action is not None else hold_still(steps)
-        target = integrator.target(commanded, observation.eef, time.monotonic(), float(deadline))
+        target = integrator.target(commanded, observation.eef, float(deadline))
         robot.send(target)
         step = Step(
             tick=t, seq=target.seq, stamp=observation.stamp, deadline=float(deadline), observation=observation,
