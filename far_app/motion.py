@@ -106,14 +106,15 @@ class TargetIntegrator:
         self._origin: dict[int, Pose] = {}
         """Pose each unacknowledged target started from, by sequence number."""
 
-    def target(self, action: Float[np.ndarray, "A"], measured: Pose, now: float, due: float) -> Target:
-        """The next target; valid for scale.expiry from now (monotonic seconds)."""
+    def target(self, action: Float[np.ndarray, "A"], measured: Pose, due: float) -> Target:
+        """The next target, of the tick with deadline due (seconds on the robot's clock); valid for scale.expiry
+        from then on."""
         pose = integrate(self._sent, measured, action, self.scale)
         seq = next(self._seq)
         self._origin[seq] = self._sent
         self._sent = pose
         return Target(
-            seq=seq, pose=pose, gripper=float(action[6]), created=now, expires=now + self.scale.expiry, due=due
+            seq=seq, pose=pose, gripper=float(action[6]), created=due, expires=due + self.scale.expiry, due=due
         )
 
     def executed(self, ack: Ack) -> Float[np.ndarray, "A"] | None:
