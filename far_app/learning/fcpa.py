@@ -74,9 +74,7 @@ class Update:
     note: str = ""
 
 
-def draw(
-    rng: np.random.Generator, states: int, draws: int, diffusion_steps: int, chunk: tuple[int, int]
-) -> Draws:
+def draw(rng: np.random.Generator, states: int, draws: int, diffusion_steps: int, chunk: tuple[int, int]) -> Draws:
     """Fresh draws; k stratified: a state's D draws fall one into each of D equal ranges, and within a range the states
     are spread evenly too."""
     spread = np.stack([rng.permutation(states) for _ in range(draws)], axis=1) + rng.random((states, draws))

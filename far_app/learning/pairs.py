@@ -78,9 +78,7 @@ def distance(
     return difference.flatten(2).norm(dim=2)
 
 
-def moderate(
-    distances: Float[Tensor, "S M"], config: PairsConfig
-) -> tuple[Bool[Tensor, "S M"], Bool[Tensor, "S"]]:
+def moderate(distances: Float[Tensor, "S M"], config: PairsConfig) -> tuple[Bool[Tensor, "S M"], Bool[Tensor, "S"]]:
     """Which candidates deviate moderately, and which states had none and so fell under the empty-set rule."""
     d_min = distances.mean(dim=1, keepdim=True) if config.d_min == "mean" else float(config.d_min)
     far_enough = distances >= d_min

@@ -19,7 +19,7 @@ RewardKind = Literal["shaped", "sparse", "real"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Episode:
+class EncodedEpisode:
     """A demonstration, or an attempt of the policy, through the eyes of a frozen encoder."""
 
     features: Float[np.ndarray, "T+1 F"]
@@ -60,7 +60,7 @@ def chunked(actions: Float[np.ndarray, "T A"], horizon: int) -> Float[np.ndarray
     return actions[index]
 
 
-def transitions(episode: Episode, horizon: int, kind: RewardKind) -> Transitions:
+def transitions(episode: EncodedEpisode, horizon: int, kind: RewardKind) -> Transitions:
     """One episode's transitions, up to its completion if it has one: what follows success is nobody's business."""
     steps = len(episode.actions)
     first = int(np.argmax(episode.success)) + 1 if episode.success.any() else steps

@@ -1,0 +1,58 @@
+"""A failed attempt as arrays: the histories the policy saw, V of every state, the chunks that were sent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from far_app.learning.cancellation import Cancelled, check
+from far_app.learning.critic import Critic
+from far_app.learning.policy import DiffusionPolicy
+from far_app.protocols import History
+from far_app.types import Attempt
+
+HISTORIES_A_PASS = 4
+"""Histories encoded between two looks at `cancelled`: a few ms for a light encoder, some 100 ms for ResNets."""
+
+
+def history(attempt: Attempt, tick: int, n_obs: int) -> History:
+    """The n_obs observations up to tick t (t = T: the final one), oldest first, the first repeated at the start."""
+    seen = [*(s.observation for s in attempt.steps), attempt.final]
+    return tuple(seen[max(0, tick - back)] for back in reversed(range(n_obs)))
+
+
+def features(
+    policy: DiffusionPolicy, attempt: Attempt, ticks: Sequence[int], cancelled: Cancelled
+) -> Float[Tensor, "S F"]:
+    """Encoder features of s_t for these ticks."""
+    parts = []
+    for first in range(0, len(ticks), HISTORIES_A_PASS):
+        check(cancelled)
+        some = ticks[first : first + HISTORIES_A_PASS]
+        parts.append(policy.encode([history(attempt, t, policy.config.n_obs) for t in some]))
+    return torch.cat(parts) if parts else torch.zeros(0, policy.feature_dim)
+
+
+def recorded_values(attempt: Attempt) -> Float[np.ndarray, "T+1"]:
+    """V(s_0) … V(s_T) as computed while the attempt ran; NaN where that was not in time, and for s_T."""
+    return np.array([*(s.value for s in attempt.steps), np.nan])
+
+
+def values(policy: DiffusionPolicy, critic: Critic, attempt: Attempt, cancelled: Cancelled) -> Float[np.ndarray, "T+1"]:
+    """V(s_0) … V(s_T): recorded where there is a record, computed now where there is none."""
+    found = recorded_values(attempt)
+    missing = np.flatnonzero(~np.isfinite(found))
+    with torch.no_grad():
+        found[missing] = critic.value(features(policy, attempt, missing.tolist(), cancelled)).numpy()
+    return found
+
+
+def sent_chunks(attempt: Attempt, ticks: Sequence[int], horizon: int) -> Float[np.ndarray, "S H A"]:
+    """a_{t:t+H−1} as sent to the arm, in [−1, 1]; the commanded action where no acknowledgment came."""
+    actions = np.stack([np.where(np.isfinite(s.sent), s.sent, s.commanded) for s in attempt.steps])
+    index = np.asarray(ticks, int)[:, None] + np.arange(horizon)
+    return np.clip(actions[index], -1.0, 1.0).astype(np.float32)

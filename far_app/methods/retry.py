@@ -1,0 +1,211 @@
+"""The one implementation behind nr, perturb, fcpa and far: learn from a failure, perturb the retry, or neither.
+
+A failure is learnt from in four steps (paper, Algorithm 1), on a private copy of the denoiser; only when all are done
+does the acting policy change, at once, to a new version. The base network is never written to, so the base policy's
+return at a trial's end is exact.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from far_app.config import RetryConfig
+from far_app.errors import ConfigError, FarError
+from far_app.learning import diffusion, fcpa
+from far_app.learning.attribution import flag, value_change
+from far_app.learning.cancellation import AdaptationCancelledError, Cancelled, check
+from far_app.learning.critic import Critic
+from far_app.learning.pairs import Pairs, candidates, merged, select, weighted_trajectory
+from far_app.learning.policy import DiffusionPolicy
+from far_app.methods.evidence import features, recorded_values, sent_chunks, values
+from far_app.perturbation import Perturbation, perturbation
+from far_app.protocols import Policy
+from far_app.seeding import generator
+from far_app.types import Adaptation, AdaptationStep, Attempt
+
+Act = Callable[[DiffusionPolicy, str], Policy]
+"""The Policy that acts with this network, under this version."""
+BASE_VERSION = "base"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ingredients:
+    """What any method is made from."""
+
+    network: DiffusionPolicy
+    """The base policy; never written to."""
+    critic: Critic | None
+    act: Act
+    config: RetryConfig = field(default_factory=RetryConfig)
+    demonstrations: fcpa.Demonstrations | None = None
+    """Only the bc guard needs them."""
+
+
+class RetryMethod:
+    """far_app.protocols.Method."""
+
+    def __init__(self, name: str, ingredients: Ingredients, adapts: bool, perturbs: bool) -> None:
+        self.name = name
+        self.adapts = adapts
+        self.base = ingredients.network
+        self.critic = ingredients.critic
+        self.config = ingredients.config
+        self.demonstrations = ingredients.demonstrations
+        self.perturbation = self.config.perturbation
+        if not perturbs:
+            self.perturbation = replace(self.perturbation, kind="none")
+        if adapts:
+            fcpa.check_config(self.config.fcpa, self.demonstrations)
+            if self.critic is None:
+                raise ConfigError(f"method '{name}' needs a critic; train one with `far train critic`, or use nr")
+        self._act = ingredients.act
+        self._swap = threading.Lock()
+        self._base_policy = self._act(self.base, BASE_VERSION)
+        self._scene = 0
+        self._trial = 0
+        self._restore()
+
+    def begin(self, scene_seed: int) -> None:
+        with self._swap:
+            self._scene = scene_seed
+            self._restore()
+
+    def adapt(self, attempt: Attempt, cancelled: Cancelled, progress: Callable[[AdaptationStep], None]) -> Adaptation:
+        trial, version = self._trial, self.policy.version
+        outdated: Cancelled = lambda: cancelled() or self._trial != trial  # noqa: E731
+        horizon = self.policy.spec.horizon
+        found = recorded_values(attempt)
+        nothing = Adaptation(
+            status="none", base_version=version, version=version, values=found,
+            value_changes=value_change(found, horizon), threshold=math.nan, flagged=(),
+        )  # fmt: skip
+        if not self.adapts:
+            return nothing
+        learning = _Learning(self, attempt, outdated, nothing)
+        try:
+            denoiser, pairs = learning.run(progress)
+            if denoiser is not None:
+                self._become(denoiser, pairs, outdated)
+                learning.note(version=self.policy.version)
+        except AdaptationCancelledError:
+            learning.note(status="cancelled")
+        except FarError as error:
+            learning.note(status="failed", note=str(error))
+        return learning.adaptation
+
+    def perturb(self, attempt_index: int, scene_seed: int) -> Perturbation:
+        return perturbation(self.perturbation, scene_seed, attempt_index)
+
+    def _restore(self) -> None:
+        self._trial += 1
+        self.acting = self.base
+        self.policy = self._base_policy
+        self.rounds: list[Pairs] = []
+        self._adaptations = 0
+
+    def _become(self, denoiser: nn.Module, pairs: Pairs, outdated: Cancelled) -> None:
+        """Swap the acting policy, unless a new trial began or nobody waits any more."""
+        network = with_denoiser(self.base, denoiser)
+        policy = self._act(network, f"{BASE_VERSION}+a{self._adaptations + 1}")
+        with self._swap:
+            check(outdated)
+            self._adaptations += 1
+            self.rounds.append(pairs)
+            self.acting, self.policy = network, policy
+
+
+def with_denoiser(network: DiffusionPolicy, denoiser: nn.Module) -> DiffusionPolicy:
+    """The same policy with other denoiser weights; encoder and normaliser are shared, not copied."""
+    other = copy.copy(network)
+    other._modules = {**network._modules, "denoiser": denoiser}
+    return other
+
+
+class _Learning:
+    """One failure's lesson: attribution → candidates → pairs → update, each timed."""
+
+    def __init__(self, method: RetryMethod, attempt: Attempt, cancelled: Cancelled, nothing: Adaptation) -> None:
+        self.method, self.attempt, self.cancelled, self.adaptation = method, attempt, cancelled, nothing
+        self.history: list[AdaptationStep] = []
+        self._last = time.monotonic()
+
+    def note(self, stage: str = "", **changes: object) -> None:
+        """Write down what is known so far, and the seconds since the last stage ended."""
+        seconds = dict(self.adaptation.seconds)
+        if stage:
+            now = time.monotonic()
+            seconds[stage] = now - self._last
+            self._last = now
+        self.adaptation = replace(self.adaptation, seconds=seconds, **changes)
+
+    def run(self, progress: Callable[[AdaptationStep], None]) -> tuple[nn.Module | None, Pairs]:
+        """The adapted denoiser (None when nothing changed) and the pairs it learnt from."""
+        method, config = self.method, self.method.config
+        critic = method.critic
+        assert critic is not None, "checked when the method was made"
+        found = values(method.base, critic, self.attempt, self.cancelled)
+        changes = value_change(found, method.policy.spec.horizon)
+        flags = flag(changes, config.attribution)
+        self.note("attribution", values=found, value_changes=changes, threshold=flags.threshold, flagged=flags.ticks)
+        pairs = self._trajectory(critic) if config.fcpa.objective == "awr" else self._pairs(critic, flags.ticks)
+        self.note("pairs", pairs=len(pairs), empty_states=pairs.empty_states)
+        if not len(pairs):
+            self.note(status="empty", note="no chunk could be paired")
+            return None, pairs
+
+        accumulate = config.fcpa.accumulate
+        denoiser = copy.deepcopy((method.acting if accumulate else method.base).denoiser).requires_grad_(True).eval()
+        update = fcpa.adapt(
+            denoiser, fcpa.Noising(add_noise=diffusion.add_noise, steps=diffusion.TRAIN_STEPS),
+            pairs if accumulate else merged([*method.rounds, pairs]), config.fcpa, self._rng("fcpa"), self.cancelled,
+            lambda step: (self.history.append(step), progress(step))[1], method.demonstrations,
+        )  # fmt: skip
+        denoiser.requires_grad_(False)
+        self.note("update", status=update.status, history=update.history, note=update.note)
+        return (denoiser if update.changed else None), pairs
+
+    def _pairs(self, critic: Critic, ticks: tuple[int, ...]) -> Pairs:
+        """Candidates under the policy that acted, filtered and ranked, for every flagged chunk."""
+        method, config = self.method, self.method.config.pairs
+        spec = method.policy.spec
+        seen = features(method.base, self.attempt, ticks, self.cancelled)
+        negatives = torch.from_numpy(sent_chunks(self.attempt, ticks, spec.horizon))
+        shape = (config.candidates, spec.horizon, spec.action_dim)
+        noise = [self._rng("candidates", t).standard_normal(shape, dtype=np.float32) for t in ticks]
+        self.note("encoding")
+
+        def denoiser(noisy: Tensor, k: Tensor, condition: Tensor) -> Tensor:
+            check(self.cancelled)
+            return method.acting.denoiser(noisy, k, condition)
+
+        def sample(condition: Tensor, start: Tensor) -> Tensor:
+            return diffusion.ddim_sample(denoiser, condition, start, method.base.config.ddim_steps)
+
+        with torch.no_grad():
+            stacked = torch.from_numpy(np.stack(noise)) if noise else torch.zeros(0, *shape)
+            chunks = candidates(sample, seen, stacked, self.cancelled)
+            if not bool(torch.isfinite(chunks).all()):
+                raise FarError(f"the policy {method.policy.version} sampled a non-finite candidate; nothing was learnt")
+            self.note("candidates")
+            return select(chunks, seen, negatives, critic.q, config)
+
+    def _trajectory(self, critic: Critic) -> Pairs:
+        """Every whole chunk of the attempt, weighted by its advantage (the awr objective)."""
+        horizon = self.method.policy.spec.horizon
+        ticks = range(len(self.attempt.steps) - horizon + 1)
+        seen = features(self.method.base, self.attempt, ticks, self.cancelled)
+        chunks = torch.from_numpy(sent_chunks(self.attempt, ticks, horizon))
+        with torch.no_grad():
+            return weighted_trajectory(seen, chunks, critic.q(seen, chunks) - critic.value(seen))
+
+    def _rng(self, purpose: str, *key: int) -> np.random.Generator:
+        return generator(purpose, self.attempt.scene_seed, self.attempt.index, *key)
