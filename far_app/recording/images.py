@@ -1,0 +1,51 @@
+"""Frames as PNG: lossless, at the policy's size, decoded only when someone looks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from far_app.errors import RecordingError
+
+_FASTEST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+"""0 would store uncompressed."""
+
+
+def encode_png(image: UInt8[np.ndarray, "H W 3"]) -> bytes:
+    """RGB to PNG; releases the interpreter's lock while it works."""
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        raise RecordingError(f"a frame of {image.dtype} {image.shape} cannot be recorded; frames are uint8 H × W × 3")
+    done, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), _FASTEST)
+    if not done:
+        raise RecordingError(f"cv2 could not encode a frame of {image.shape}")
+    return png.tobytes()
+
+
+def decode_png(png: bytes) -> UInt8[np.ndarray, "H W 3"]:
+    """PNG to RGB. Raises RecordingError for damaged bytes."""
+    bgr = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR) if png else None
+    if bgr is None:
+        raise RecordingError(f"a frame of {len(png)} bytes is not a readable PNG")
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+class LazyImages(Mapping[str, np.ndarray]):
+    """Camera name to RGB, as in Observation.images; each frame is decoded when it is asked for."""
+
+    def __init__(self, frames: Mapping[str, Callable[[], np.ndarray]]) -> None:
+        self._frames = dict(frames)
+
+    def __getitem__(self, camera: str) -> np.ndarray:
+        return self._frames[camera]()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._frames)
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __repr__(self) -> str:
+        return f"LazyImages({', '.join(self._frames)})"
