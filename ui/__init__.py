@@ -1,1 +1,1 @@
-"""What the operator sees: view models, the viser page, rerun views. Reads telemetry, sends intents; never imports hw."""
+"""What the operator sees: view models, the viser page, rerun views. Reads telemetry, sends intents only."""

@@ -1,0 +1,277 @@
+"""The operator page: builds viser's widgets once and updates what changed. Callbacks only enqueue.
+
+Shared widgets (server.gui), so late joiners see everything; look and place of each are style.css's.
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+from viser import uplot
+
+from far_app.session_states import Intent, State
+from far_app.telemetry import Telemetry, View
+from far_app.types import RobotMode
+from ui import html
+from ui.plot_model import change_plot, value_plot
+from ui.scene3d import BRAND, FLAGGED, Scene3D
+from ui.stop import StopLine
+from ui.view_model import Freshness, adaptation, arm_word, banner, control, loop_gauges, summary
+
+CAMERAS = ("front", "wrist")
+_STYLE = (Path(__file__).parent / "style.css").read_text(encoding="utf-8")
+_BLANK = np.full((8, 8, 3), 8, np.uint8)
+_RED = "rgb(255, 77, 79)"
+_BLUE = "rgb(63, 184, 255)"
+_CLEAR = "rgba(0, 0, 0, 0)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Button:
+    intent: Intent
+    label: str
+    key: Any
+    """Hotkey; None for what must be clicked."""
+    color: tuple[int, int, int]
+    box: tuple[float, float, float, float]
+    """Left, top, width, height in page units, below the head."""
+
+
+_QUIET, _GREEN, _AMBER = (36, 50, 65), (31, 122, 77), (140, 92, 16)
+_COLUMNS, _WIDTH, _HEIGHT = (0.7, 12.15), 10.85, 4.3
+
+
+def _control(intent: Intent, label: str, key: Any, color: tuple[int, int, int], column: int, row: int) -> _Button:
+    box = (_COLUMNS[column], 11.7 + 4.9 * row, _WIDTH, _HEIGHT)
+    return _Button(intent=intent, label=label, key=key, color=color, box=box)
+
+
+_BUTTONS = (
+    _control(Intent.PAUSE, "Pause", "P", _QUIET, 0, 0),
+    _control(Intent.RESUME, "Resume", "R", BRAND, 1, 0),
+    _control(Intent.MARK_SUCCESS, "Mark success", "S", _GREEN, 0, 1),
+    _control(Intent.MARK_FAILURE, "Mark failure", "F", _AMBER, 1, 1),
+    _control(Intent.SKIP_TRIAL, "Skip trial", "K", _QUIET, 0, 2),
+    _control(Intent.SCENE_READY, "Scene ready", "N", BRAND, 1, 2),
+    _Button(intent=Intent.QUIT, label="End session", key=None, color=_QUIET, box=(0.7, 26.4, 22.3, 3.3)),
+)
+
+
+class Console:
+    """One page for all clients. `update` is called from one thread only."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        stop_line: StopLine,
+        latest: Callable[[], tuple[Telemetry | None, Freshness]],
+        *,
+        scene3d: bool,
+        viewer: str | None,
+    ) -> None:
+        self.pressed: queue.SimpleQueue[Intent] = queue.SimpleQueue()
+        """Intents that passed the guard, for the caller to send."""
+        self.refusal = ""
+        """Why the page itself refused the last press."""
+        self._gui, self._stop, self._latest, self._viewer = server.gui, stop_line, latest, viewer
+        self._refused_at = 0.0
+        self._beats = 0
+        self._images: dict[str, viser.GuiImageHandle] = {}
+        self._pictures: dict[str, bytes] = {}
+        self._controls: dict[Intent, tuple[_Button, viser.GuiButtonHandle, Any]] = {}
+        self._plotted: tuple[object, ...] = ()
+        self._length = 151
+        server.gui.configure_theme(dark_mode=True, brand_color=BRAND, show_logo=False, show_share_button=False)
+        server.gui.set_panel_label("FAR")
+        self.scene = Scene3D(server) if scene3d else None
+        self._build()
+
+    def _build(self) -> None:
+        gui = self._gui
+        fresh = Freshness()
+        self._root = gui.add_html('<div class="far-root"></div>')
+        self._beat = gui.add_html(html.beat(0, fresh))
+        self._head = gui.add_html(html.head(banner(None, fresh), arm_word(None)))
+        stop = gui.add_button("STOP", color=FLAGGED)
+        self._stop_note = gui.add_html(html.stop_note(None, False, ""))
+        hotkey = gui.add_command("STOP the arm", description="Latches the arm at once", hotkey="space")
+
+        @stop.on_click
+        async def _(_: object) -> None:
+            self._press_stop("page: button")
+
+        @hotkey.on_trigger
+        async def _(_: object) -> None:
+            self._press_stop("page: space key")
+
+        places = [_place(stop, (0.7, 0.7, 22.3, 8.6)), _big(stop)]
+        places += [self._add_control(button) for button in _BUTTONS]
+        self._adapt = gui.add_html(html.adaptation(adaptation(None)))
+        self._history = gui.add_html(html.history((), summary(())))
+        self._events = gui.add_html(html.events((), 0.0))
+        self._add_cameras()
+        self._add_plots()
+        self._foot = gui.add_html(html.foot((), "", self._viewer, ""))
+        gui.add_html(f"<style>{_STYLE}\n@media (min-width: 768px) {{ {' '.join(places)} }}</style>")
+
+    def _add_control(self, button: _Button) -> str:
+        handle = self._gui.add_button(button.label, disabled=True, color=button.color)
+
+        @handle.on_click
+        async def _(_: object) -> None:
+            self._press(button.intent)
+
+        command = None
+        if button.key is not None:
+            command = self._gui.add_command(button.label, hotkey=button.key, disabled=True)
+
+            @command.on_trigger
+            async def _(_: object) -> None:
+                self._press(button.intent, by_key=True)
+
+        self._controls[button.intent] = (button, handle, command)
+        return _place(handle, button.box)
+
+    def _add_cameras(self) -> None:
+        for camera in CAMERAS:
+            self._gui.add_html(html.caption(camera, "", f"mark-{camera}"))
+            self._images[camera] = self._gui.add_image(_BLANK, format="jpeg")
+
+    def _add_plots(self) -> None:
+        axes = (_axis(size=24), _axis(size=42))
+        dots: Any = {"show": False}
+        still: Any = {"show": False}
+        clear: Any = {"stroke": _CLEAR, "points": dots, "scale": "flag"}
+        frame: Any = {"stroke": _CLEAR, "points": dots}
+        # Only `frame` sets the y axis: a series that begins with NaN would make uPlot's range NaN.
+        v = value_plot(None)
+        self._value_caption = self._gui.add_html(html.value_caption(None))
+        self._value = self._gui.add_uplot(
+            (v.tick, v.shade, v.floor, v.value, v.frame),
+            ({"label": "tick"}, clear, clear, {"stroke": _BLUE, "width": 2.5, "points": dots, "auto": False}, frame),
+            bands=(uplot.Band(series=(1, 2), fill="rgba(255, 77, 79, 0.38)"),),
+            scales=_scales(150) | {"flag": uplot.Scale(range=(0.0, 1.0))},
+            axes=axes, legend={"show": False}, cursor=still, aspect=2.6, padding=(8, 20, 0, 0),
+        )  # fmt: skip
+        c = change_plot(None)
+        self._change_caption = self._gui.add_html(html.change_caption(None))
+        flagged: Any = {"show": True, "size": 8, "fill": _RED, "stroke": _RED}
+        self._change = self._gui.add_uplot(
+            (c.tick, c.zero, c.change, c.threshold, c.flagged, c.frame),
+            (
+                {"label": "tick"},
+                {"stroke": "rgb(59, 76, 94)", "width": 1, "points": dots, "auto": False},
+                {"stroke": "rgb(170, 190, 208)", "width": 2, "points": dots, "auto": False},
+                {"stroke": _RED, "width": 1.5, "dash": (6, 5), "points": dots, "auto": False},
+                {"stroke": _CLEAR, "points": flagged, "auto": False},
+                frame,
+            ),
+            scales=_scales(150),
+            axes=axes, legend={"show": False}, cursor=still, aspect=2.85, padding=(8, 20, 0, 0),
+        )  # fmt: skip
+
+    def _press_stop(self, source: str) -> None:
+        self._stop.press(source)
+        self.pressed.put(Intent.STOP)
+
+    def _press(self, intent: Intent, by_key: bool = False) -> None:
+        """The guard: viser does not enforce `disabled`, a raw client may press anything at any time."""
+        telemetry, fresh = self._latest()
+        asked = control(intent, telemetry, fresh)
+        if by_key and intent is Intent.RESUME and asked.enabled and telemetry and telemetry.state is not State.PAUSED:
+            self._refuse(intent, "after a stop or a fault, click it")
+        elif asked.enabled:
+            self.pressed.put(intent)
+        else:
+            self._refuse(intent, asked.reason)
+
+    def _refuse(self, intent: Intent, reason: str) -> None:
+        self.refusal = f"{intent.value.replace('_', ' ')} refused: {reason}"
+        self._refused_at = time.monotonic()
+
+    def beat(self, fresh: Freshness) -> None:
+        """Twice a second while all is well: keeps the browser's dead-man overlay down."""
+        self._beats += 1
+        self._beat.content = html.beat(self._beats, fresh)
+
+    def text(self, telemetry: Telemetry | None, view: View | None, fresh: Freshness) -> None:
+        """Words, buttons, tables; viser sends only what changed."""
+        status = view.status if view is not None and not fresh.hw_silent else None
+        self._head.content = html.head(banner(telemetry, fresh), arm_word(status))
+        latched = status is not None and status.mode is RobotMode.LATCHED
+        self._stop_note.content = html.stop_note(self._stop.result, latched, status.reason if status else "")
+        for intent, (button, handle, command) in self._controls.items():
+            now = control(intent, telemetry, fresh)
+            line = (f"key {button.key}" if button.key else "") if now.enabled else now.reason
+            handle.disabled, handle.label = not now.enabled, f"{button.label}\n{line}"
+            if command is not None:
+                command.disabled = not now.enabled
+        self._adapt.content = html.adaptation(adaptation(telemetry))
+        refusal = self.refusal if time.monotonic() - self._refused_at < 6 else ""
+        gauges, session = loop_gauges(telemetry), telemetry.session if telemetry else ""
+        if telemetry is not None:
+            self._history.content = html.history(telemetry.history, summary(telemetry.history))
+            self._events.content = html.events(telemetry.log, telemetry.stamp)
+            refusal = refusal or telemetry.refusal
+        self._foot.content = html.foot(gauges, refusal, self._viewer, session)
+
+    def pictures(self, view: View) -> None:
+        """The cameras' JPEGs as they came: no decoding and no encoding on the way to the browser."""
+        for camera, image in self._images.items():
+            jpeg = view.jpegs.get(camera)
+            if jpeg is not None and jpeg is not self._pictures.get(camera):
+                image._data = jpeg
+                self._pictures[camera] = jpeg
+
+    def plots(self, telemetry: Telemetry) -> None:
+        t = telemetry
+        last = float(t.values[-1]) if len(t.values) else 0.0
+        key = (t.trial, t.attempt, len(t.values), last, len(t.value_changes), t.flagged, t.horizon)
+        if key == self._plotted:
+            return
+        self._plotted = key
+        v, c = value_plot(t), change_plot(t)
+        if len(v.tick) != self._length:
+            self._length = len(v.tick)
+            self._value.scales = _scales(self._length - 1) | {"flag": uplot.Scale(range=(0.0, 1.0))}
+            self._change.scales = _scales(self._length - 1)
+        self._value_caption.content, self._change_caption.content = html.value_caption(t), html.change_caption(t)
+        self._value.data = (v.tick, v.shade, v.floor, v.value, v.frame)
+        self._change.data = (c.tick, c.zero, c.change, c.threshold, c.flagged, c.frame)
+
+
+def _place(handle: viser.GuiButtonHandle, box: tuple[float, float, float, float]) -> str:
+    left, top, width, height = box
+    return (
+        f'div:has(> [id="{handle._impl.uuid}"]) {{ left: calc({left} * var(--u)); width: calc({width} * var(--u)); '
+        f"top: calc(var(--head) + {top} * var(--u)); height: calc({height} * var(--u)); }}"
+    )
+
+
+def _big(handle: viser.GuiButtonHandle) -> str:
+    """STOP: large, white on red, above even the dead-man overlay."""
+    button = f'button[id="{handle._impl.uuid}"].mantine-Button-root'
+    return (
+        f"{button} {{ color: #fff !important; }} "
+        f"{button} .mantine-Button-label::first-line {{ font-size: calc(4.6 * var(--u)); font-weight: 800; "
+        f"letter-spacing: .04em; }} div:has(> {button}) {{ z-index: 70 !important; }}"
+    )
+
+
+def _scales(last_tick: int) -> dict[str, Any]:
+    """A fixed x range: with an automatic one viser keeps 0 … 1 of a plot that began without data."""
+    return {"x": uplot.Scale(time=False, range=(0.0, float(last_tick)))}
+
+
+def _axis(size: int) -> Any:
+    return {
+        "stroke": "rgb(143, 161, 179)", "size": size, "font": "14px sans-serif", "gap": 4,
+        "grid": {"stroke": "rgba(255, 255, 255, 0.05)", "width": 1}, "ticks": {"show": False},
+    }  # fmt: skip

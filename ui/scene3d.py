@@ -1,0 +1,121 @@
+"""The twin in 3D: its meshes moved by body poses, the predicted chunk path, the attempt's trail with flagged parts red.
+
+Positions are metres in the arm's base frame.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+from jaxtyping import Float
+
+from far_app.telemetry import SceneGeometry, Telemetry
+from ui.plot_model import flagged_ticks
+
+BRAND = (63, 184, 255)
+FLAGGED = (255, 77, 79)
+TRAIL = (84, 110, 138)
+STILL = 1e-5
+"""Changes of a body's pose below this (metres, quaternion units) are not sent."""
+TRAIL_LIMIT = 600
+"""Points of the trail at most; older ones go."""
+
+
+class Scene3D:
+    """Owns what is drawn; call from one thread."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._scene = server.scene
+        self._frames: dict[int, viser.FrameHandle] = {}
+        self._shown: Float[np.ndarray, "B 7"] | None = None
+        self._trail: list[tuple[int, Float[np.ndarray, "3"]]] = []
+        self._attempt = (0, 0)
+        self._path: viser.LineSegmentsHandle | None = None
+        self._trail_line: viser.LineSegmentsHandle | None = None
+        self._trail_key: tuple[object, ...] = ()
+        server.initial_camera.position = (1.25, -0.95, 0.75)
+        server.initial_camera.look_at = (0.38, 0.0, 0.16)
+        server.initial_camera.fov = 0.7
+        self._scene.configure_default_lights(enabled=True, cast_shadow=False)
+
+    def build(self, geometry: SceneGeometry) -> None:
+        """Meshes under one frame a body; called once for each hw server."""
+        for frame in self._frames.values():
+            frame.remove()
+        self._frames.clear()
+        self._shown = None
+        for index, mesh in enumerate(geometry.meshes):
+            if mesh.body not in self._frames:
+                self._frames[mesh.body] = self._scene.add_frame(f"/twin/{mesh.body}", show_axes=False)
+            r, g, b, a = mesh.rgba
+            self._scene.add_mesh_simple(
+                f"/twin/{mesh.body}/{index}",
+                vertices=np.asarray(mesh.vertices, dtype=np.float32),
+                faces=np.asarray(mesh.faces, dtype=np.uint32),
+                color=(int(255 * r), int(255 * g), int(255 * b)),
+                opacity=None if a >= 1 else float(a),
+                cast_shadow=False,
+                receive_shadow=False,
+                side="double",
+            )
+
+    def pose(self, body_poses: Float[np.ndarray, "B 7"]) -> None:
+        """Position and xyzw quaternion by body; only what moved is sent."""
+        before = self._shown
+        for body, frame in self._frames.items():
+            if body >= len(body_poses):
+                continue
+            if before is not None and np.abs(body_poses[body] - before[body]).max() < STILL:
+                continue
+            x, y, z, w = body_poses[body, 3:7]
+            frame.position = body_poses[body, :3]
+            frame.wxyz = np.array([w, x, y, z])
+        if before is None:
+            self._shown = np.array(body_poses)
+        else:
+            moved = np.abs(body_poses - before).max(axis=1) >= STILL
+            before[moved] = body_poses[moved]
+
+    def chunk(self, telemetry: Telemetry) -> None:
+        """The path of the newest chunk, brand-coloured; red when that chunk is flagged."""
+        points = np.asarray(telemetry.chunk_path, dtype=np.float32)
+        if len(points) < 2:
+            if self._path is not None:
+                self._path.visible = False
+            return
+        segments = np.stack([points[:-1], points[1:]], axis=1)
+        color = FLAGGED if telemetry.tick in telemetry.flagged else BRAND
+        colors = np.broadcast_to(np.array(color, np.uint8), segments.shape).copy()
+        if self._path is None or self._path.points.shape != segments.shape:
+            self._path = self._scene.add_line_segments("/chunk", segments, colors, thickness=0.006)
+        else:
+            self._path.points, self._path.colors, self._path.visible = segments, colors, True
+
+    def trail(self, telemetry: Telemetry) -> None:
+        """Where the hand has been in this attempt; after a failure the flagged chunks' parts turn red."""
+        attempt = (telemetry.trial, telemetry.attempt)
+        if attempt != self._attempt:
+            self._attempt, self._trail = attempt, []
+        eef = telemetry.eef
+        if (
+            eef is not None
+            and telemetry.state == "running"
+            and (not self._trail or telemetry.tick > self._trail[-1][0])
+        ):
+            self._trail.append((telemetry.tick, np.array(eef.position, dtype=np.float32)))
+            del self._trail[:-TRAIL_LIMIT]
+        key = (attempt, len(self._trail), telemetry.flagged)
+        if key == self._trail_key:
+            return
+        self._trail_key = key
+        if len(self._trail) < 2:
+            if self._trail_line is not None:
+                self._trail_line.visible = False
+            return
+        points = np.stack([p for _, p in self._trail])
+        segments = np.stack([points[:-1], points[1:]], axis=1)
+        covered = flagged_ticks(telemetry.flagged, telemetry.chunk_horizon, self._trail[-1][0] + 1)
+        red = np.array([covered[tick] for tick, _ in self._trail[1:]])
+        colors = np.where(red[:, None, None], np.array(FLAGGED, np.uint8), np.array(TRAIL, np.uint8))
+        colors = np.broadcast_to(colors, segments.shape).astype(np.uint8)
+        self._trail_line = self._scene.add_line_segments("/trail", segments, colors, thickness=0.004)

@@ -1,0 +1,184 @@
+"""The ui process: python -m ui.server --run-folder DIR [--host 127.0.0.1] [--port 8080].
+
+Reads telemetry and views, shows them, sends intents; may die and come back at any time. One thread does everything but
+STOP (its own line) and viser's event loop. Exits 0 on SIGTERM or SIGINT, and when its parent dies.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import gc
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from far_app.endpoints import Endpoints
+from far_app.errors import FarError
+from far_app.session_states import Intent
+from far_app.telemetry import Telemetry
+from ui.console import Console
+from ui.feeds import Feeds
+from ui.page_server import open_page, page_url
+from ui.stop import StopLine
+from ui.view_model import Freshness
+
+log = logging.getLogger(__name__)
+
+TICK = 1 / 15
+"""Seconds between two looks at the sockets; poses are pushed at this rate."""
+PR_SET_PDEATHSIG = 1
+
+
+@dataclass
+class Every:
+    """True once a period; keeps its mean rate even where it is asked at a rate that is no multiple."""
+
+    period: float
+    due: float = 0.0
+
+    def __call__(self, now: float) -> bool:
+        if now < self.due:
+            return False
+        on_time = self.due + self.period > now
+        self.due = self.due + self.period if on_time else now + self.period
+        return True
+
+
+@dataclass(frozen=True, kw_only=True)
+class PageOptions:
+    run_folder: Path
+    host: str = "127.0.0.1"
+    port: int = 8080
+    scene3d: bool = True
+    operator: str = "operator"
+    viewer: str | None = None
+    """Address of the rerun viewer, linked from the page; None for no link."""
+
+
+class Page:
+    """Feeds, console and STOP line of one ui process."""
+
+    def __init__(self, options: PageOptions) -> None:
+        self._options = options
+        endpoints = Endpoints.in_folder(options.run_folder)
+        self._server = open_page(options.host, options.port)
+        self.port = self._server.get_port()
+        self._feeds = Feeds(endpoints)
+        self._stop_line = StopLine(endpoints.stop)
+        self._console = Console(
+            self._server, self._stop_line, self._latest, scene3d=options.scene3d, viewer=options.viewer
+        )
+        self._pictures, self._plots, self._texts, self._beats = Every(1 / 12), Every(1 / 5), Every(1 / 5), Every(1 / 2)
+        self._hw_seq = 0
+
+    def _latest(self) -> tuple[Telemetry | None, Freshness]:
+        return self._feeds.telemetry.message, self._fresh()
+
+    def _fresh(self) -> Freshness:
+        return Freshness(app=self._feeds.telemetry.age(), hw=self._feeds.view.age())
+
+    def tick(self) -> None:
+        """One look at the sockets; whatever is due is sent to the browsers in one window."""
+        now = time.monotonic()
+        self._send_intents()
+        heard = self._feeds.telemetry.poll()
+        telemetry, fresh = self._latest()
+        with self._server.atomic():
+            self._show_view(now)
+            if self._beats(now) and not (telemetry is not None and fresh.app is None):
+                self._console.beat(fresh)
+            if self._texts(now):
+                self._console.text(telemetry, self._feeds.view.message, fresh)
+            if telemetry is not None and heard:
+                if self._plots(now):
+                    self._console.plots(telemetry)
+                if self._console.scene is not None:
+                    self._console.scene.chunk(telemetry)
+                    self._console.scene.trail(telemetry)
+
+    def _show_view(self, now: float) -> None:
+        scene = self._console.scene
+        if scene is not None:
+            geometry = self._feeds.geometry.poll()
+            if geometry is not None:
+                scene.build(geometry)
+        if not self._feeds.view.poll():
+            return
+        view = self._feeds.view.message
+        if view.seq < self._hw_seq:
+            self._feeds.geometry.again()
+        self._hw_seq = view.seq
+        if scene is not None:
+            scene.pose(view.body_poses)
+        if self._pictures(now):
+            self._console.pictures(view)
+
+    def _send_intents(self) -> None:
+        while not self._console.pressed.empty():
+            intent = self._console.pressed.get()
+            if not self._feeds.send(intent, self._options.operator) and intent is not Intent.STOP:
+                log.warning("nobody takes the intent %s: is the app running?", intent.value)
+
+    def close(self) -> None:
+        self._stop_line.close()
+        self._feeds.close()
+        self._server.stop()
+
+
+def serve(options: PageOptions, ended: threading.Event) -> None:
+    """Run the page until `ended` is set or our parent is gone."""
+    parent = os.getppid()
+    page = Page(options)
+    log.info("the operator page is at %s", page_url(options.host, page.port))
+    gc.freeze()
+    try:
+        due = time.monotonic()
+        while not ended.is_set() and os.getppid() == parent:
+            page.tick()
+            due = max(due + TICK, time.monotonic())
+            ended.wait(due - time.monotonic())
+    finally:
+        page.close()
+
+
+def die_with_parent() -> None:
+    """Linux: SIGTERM to us when our parent dies, even by SIGKILL."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def parse(arguments: Sequence[str] | None) -> PageOptions:
+    parser = argparse.ArgumentParser(prog="python -m ui.server", description="The operator page of one run.")
+    parser.add_argument("--run-folder", type=Path, required=True, help="folder with the run's sockets")
+    parser.add_argument("--host", default="127.0.0.1", help="loopback address to bind")
+    parser.add_argument("--port", type=int, default=8080, help="0 lets the system choose")
+    parser.add_argument("--operator", default="operator", help="name stored with every intent")
+    parser.add_argument("--viewer", default=None, help="address of the rerun viewer to link to")
+    parser.add_argument("--no-scene3d", dest="scene3d", action="store_false", help="leave out the twin's meshes")
+    return PageOptions(**vars(parser.parse_args(arguments)))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
+    options = parse(arguments)
+    ended = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: ended.set())
+    die_with_parent()
+    try:
+        serve(options, ended)
+    except FarError as error:
+        log.error("%s", error)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
