@@ -1,0 +1,107 @@
+"""What the operator page is told: the session's side of far_app/telemetry.py, gathered by the loop, read whole."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+
+import numpy as np
+
+from far_app.config import TaskConfig
+from far_app.motion import ActionScale
+from far_app.session_states import State, allowed
+from far_app.telemetry import LogLine, Telemetry, TrialRow
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, Observation, Step, Trial
+
+
+class Board:
+    """Filled and read by the loop's thread only; `telemetry` is handed to the publisher."""
+
+    def __init__(
+        self, task: TaskConfig, scale: ActionScale, *, session: str, method: str, trials: int, chunk_horizon: int
+    ) -> None:
+        self._task, self._scale = task, scale
+        self._session, self._method, self._trials = session, method, trials
+        self._chunk_horizon = chunk_horizon
+        self._history = deque[TrialRow](maxlen=200)
+        self._log = deque[LogLine](maxlen=50)
+        self._values: list[float] = []
+        self._step: Step | None = None
+        self._chunk: ActionChunk | None = None
+        self._adaptation: Adaptation | None = None
+        self._began = time.monotonic()
+        self.reason = ""
+        self.refusal = ""
+        self.adaptation_steps: tuple[AdaptationStep, ...] = ()
+        self.adapting = False
+        self.trial = self.attempt = self.scene_seed = 0
+        self.policy_version = ""
+
+    def log(self, text: str, level: str = "info") -> None:
+        self._log.append(LogLine(stamp=time.monotonic(), level=level, text=text))
+
+    def trial_started(self, trial: int, scene_seed: int) -> None:
+        self.trial, self.scene_seed, self.attempt = trial, scene_seed, 1
+        self._began = time.monotonic()
+        self._clear()
+
+    def attempt_started(self, attempt: int, policy_version: str) -> None:
+        self.attempt, self.policy_version = attempt, policy_version
+        self._clear()
+
+    def stepped(self, step: Step) -> None:
+        """V of a tick often arrives with a later one; the curve has one entry a tick, NaN where there is none."""
+        self._step = step
+        self._values.append(step.value)
+
+    def planned(self, chunk: ActionChunk) -> None:
+        self._chunk = chunk
+        if 0 <= chunk.tick < len(self._values):
+            self._values[chunk.tick] = chunk.value
+
+    def adapted(self, adaptation: Adaptation) -> None:
+        self.adapting, self._adaptation = False, adaptation
+        self.adaptation_steps = adaptation.history or self.adaptation_steps
+
+    def trial_ended(self, trial: Trial, judged_by: str, note: str) -> None:
+        self._history.append(
+            TrialRow(
+                trial=self.trial, scene_seed=self.scene_seed, attempts=len(trial.attempts), success=trial.success,
+                judged_by=judged_by, flagged=sum(len(a.flagged) for a in trial.adaptations),
+                seconds=time.monotonic() - self._began, note=note,
+            )
+        )  # fmt: skip
+
+    def telemetry(self, state: State, newest: Observation | None) -> Telemetry:
+        """A snapshot; sequence number, stamp and loop health are the publisher's."""
+        adaptation, step = self._adaptation, self._step
+        values = adaptation.values if adaptation is not None and len(adaptation.values) else self._values
+        status = "attribution" if self.adapting and not self.adaptation_steps else "update" if self.adapting else ""
+        return Telemetry(
+            seq=0, stamp=0.0, state=state, reason=self.reason, session=self._session, task=self._task.name,
+            method=self._method, policy_version=self.policy_version, trial=self.trial, trials=self._trials,
+            attempt=self.attempt, max_attempts=self._task.max_attempts, scene_seed=self.scene_seed,
+            tick=len(self._values), horizon=self._task.horizon, rate=self._task.rate, chunk_horizon=self._chunk_horizon,
+            values=np.array(values, dtype=float),
+            value_changes=adaptation.value_changes if adaptation else np.zeros(0),
+            threshold=adaptation.threshold if adaptation else float("nan"),
+            flagged=adaptation.flagged if adaptation else (),
+            adaptation=self.adaptation_steps, adaptation_status=status or (adaptation.status if adaptation else ""),
+            pairs=adaptation.pairs if adaptation else 0,
+            homing_progress=newest.status.homing_progress if newest else 0.0,
+            robot=newest.status if newest else None, joints=newest.joints if newest else np.zeros(0),
+            eef=newest.eef if newest else None, gripper=newest.gripper if newest else 0.0,
+            action=step.commanded if step is not None else np.zeros(0), chunk_path=self._path(newest),
+            history=tuple(self._history), log=tuple(self._log), refusal=self.refusal, allowed=allowed(state),
+        )  # fmt: skip
+
+    def _path(self, newest: Observation | None) -> np.ndarray:
+        """Positions the newest chunk leads through from here, metres (H, 3)."""
+        if self._chunk is None or newest is None:
+            return np.zeros((0, 3))
+        return newest.eef.position + self._scale.translation * np.cumsum(self._chunk.actions[:, :3], axis=0)
+
+    def _clear(self) -> None:
+        self._values = []
+        self._step = self._chunk = self._adaptation = None
+        self.adaptation_steps, self.adapting = (), False

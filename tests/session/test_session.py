@@ -1,0 +1,230 @@
+"""The real-time session against a robot whose misbehaviour the test sets. Rates are raised so that trials are short."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from far_app.detectors import TwinCheck
+from far_app.motion import ActionScale
+from far_app.protocols import Hold, Home, Resume
+from far_app.session.inbox import IntentInbox
+from far_app.session.planners import ThreadedPlanner
+from far_app.session.recorder import Recorder
+from far_app.session.session import Session, SessionSettings
+from far_app.session.statistics import LoopStatistics
+from far_app.session.supervision import Freshness, SessionFault
+from far_app.session_states import Intent, State
+from far_app.tasks import task
+from far_app.types import Judge
+from tests.session.kinematic import Faster, Forward, KinematicRobot
+
+
+class Desk:
+    """A session with everything a test may want to touch."""
+
+    def __init__(self, robot=None, policy=None, adapting_seconds=0.0, horizon=20, attempts=3, **settings) -> None:
+        self.robot = robot or KinematicRobot()
+        self.method = Faster(policy or Forward(), adapting_seconds)
+        self.inbox = IntentInbox()
+        self.statistics = LoopStatistics()
+        settings = {"name": "test", "trials": 1, "seed": 5, "headless": True} | settings
+        self.session = Session(
+            settings=SessionSettings(**settings), robot=self.robot, planner=ThreadedPlanner(), method=self.method,
+            detector=TwinCheck(2), scale=ActionScale(), recorder=Recorder(), inbox=self.inbox,
+            task=replace(task("lift"), horizon=horizon, max_attempts=attempts, rate=100.0), statistics=self.statistics,
+        )  # fmt: skip
+
+    @property
+    def state(self) -> State:
+        return self.session.supervision.state
+
+    def when(self, condition, act) -> None:
+        """In a thread: as soon as the condition holds, act."""
+
+        def wait():
+            deadline = time.monotonic() + 20
+            while time.monotonic() < deadline:
+                if condition():
+                    return act()
+                time.sleep(0.002)
+            return None
+
+        threading.Thread(target=wait, daemon=True).start()
+
+    def moving(self) -> bool:
+        return self.state is State.RUNNING and len(self.robot.targets) > 3
+
+
+def test_a_trial_succeeds_with_no_button_and_the_arm_is_held_at_the_end():
+    desk = Desk()
+    (result,) = desk.session.run()
+    assert (result.seed, result.attempts, result.success, result.judged_by) == (5, 1, True, "twin")
+    assert desk.state is State.FINISHED
+    assert isinstance(desk.robot.requests[-1], Hold)
+    assert desk.statistics.starved == 0 and desk.statistics.ticks == len(desk.robot.targets) > 10
+    assert len(desk.statistics.late) >= desk.statistics.ticks - 1
+
+
+def test_a_failure_is_adapted_from_in_the_background_and_the_retry_runs_the_new_version():
+    desk = Desk(policy=Forward(speed=0.1))
+    (result,) = desk.session.run()
+    assert result.success and result.attempts == 3
+    assert desk.method.adapted_attempts == [1, 2]
+    versions = [a.policy_version for a in desk.session._attempts]
+    assert versions == ["forward-0", "forward-0+1", "forward-0+1+2"]
+    assert desk.method.policy.version == "forward-0", "the base policy returns at the trial's end"
+
+
+def test_a_slow_policy_never_blocks_a_tick():
+    desk = Desk(policy=Forward(speed=0.25, seconds=0.03), horizon=60)
+    (result,) = desk.session.run()
+    assert result.success
+    steps = desk.session._attempts[0].steps
+    assert all(not s.starved for s in steps), "the newest valid plan continues"
+    assert max(s.tick - s.chunk_tick for s in steps) >= 3
+
+
+def test_an_adaptation_over_its_limit_is_cancelled_and_the_previous_version_retries():
+    desk = Desk(policy=Forward(speed=0.1), adapting_seconds=30.0, attempts=2, adaptation_limit=0.1)
+    began = time.monotonic()
+    desk.session.run()
+    assert time.monotonic() - began < 10
+    assert [a.status for a in desk.session._adaptations] == ["timeout"]
+    assert [a.policy_version for a in desk.session._attempts] == ["forward-0", "forward-0"]
+
+
+def test_pause_holds_the_arm_and_resume_starts_from_the_measured_pose():
+    desk = Desk(headless=False)
+    seen = {}
+
+    def pause():
+        desk.inbox.put(Intent.PAUSE)
+        desk.when(lambda: desk.state is State.PAUSED, disturb)
+
+    def disturb():
+        time.sleep(0.1)
+        seen["targets"] = len(desk.robot.targets)
+        moved = desk.robot.pose.position + np.array([-0.02, 0.03, 0.0])
+        desk.robot.pose = replace(desk.robot.pose, position=moved)  # someone pushes the arm
+        seen["pose"] = moved
+        time.sleep(0.1)
+        assert len(desk.robot.targets) == seen["targets"], "no target while paused"
+        desk.inbox.put(Intent.RESUME)
+
+    desk.when(desk.moving, pause)
+    (result,) = desk.session.run()
+    assert result.success
+    assert any(isinstance(r, Hold) and "paused" in r.reason for r in desk.robot.requests)
+    first = desk.robot.targets[seen["targets"]]
+    assert np.linalg.norm(first.pose.position - seen["pose"]) <= ActionScale().translation + 1e-9
+
+
+def test_stop_ends_the_attempt_and_only_resume_goes_on():
+    desk = Desk(headless=False, attempts=2)
+
+    def resume():
+        time.sleep(0.2)
+        assert desk.state is State.STOPPED
+        desk.inbox.put(Intent.SKIP_TRIAL)
+        time.sleep(0.1)
+        assert desk.state is State.STOPPED and "resume first" in desk.session.board.refusal
+        desk.inbox.put(Intent.RESUME)
+
+    desk.when(desk.moving, lambda: desk.inbox.put(Intent.STOP))
+    desk.when(lambda: desk.state is State.STOPPED, resume)
+    (result,) = desk.session.run()
+    assert result.success and result.attempts == 2
+    stopped = desk.session._attempts[0].outcome
+    assert not stopped.success and stopped.judged_by is Judge.OPERATOR and "STOP" in stopped.note
+    assert desk.method.adapted_attempts == [], "a stop teaches nothing"
+    kinds = [type(r) for r in desk.robot.requests]
+    assert kinds.index(Resume) < len(kinds) - 1 - kinds[::-1].index(Home)
+
+
+def test_a_latch_of_the_hw_server_stops_the_session_even_on_the_way_home():
+    desk = Desk(robot=KinematicRobot(homing_ticks=60), headless=False)
+    desk.when(lambda: desk.state is State.HOMING and desk.robot.status.mode == "homing",
+              lambda: desk.robot.latch("STOP pressed"))  # fmt: skip
+    desk.when(lambda: desk.state is State.STOPPED, lambda: (time.sleep(0.1), desk.inbox.put(Intent.RESUME)))
+    (result,) = desk.session.run()
+    assert result.success and result.attempts == 1
+    assert sum(isinstance(r, Home) for r in desk.robot.requests) == 2, "the way home is asked for again"
+
+
+@pytest.mark.parametrize("intent, success", [(Intent.MARK_SUCCESS, True), (Intent.MARK_FAILURE, False)])
+def test_the_operators_word_ends_an_attempt(intent, success):
+    desk = Desk(policy=Forward(speed=0.01), horizon=500, attempts=1, headless=False)
+    desk.when(desk.moving, lambda: desk.inbox.put(intent))
+    (result,) = desk.session.run()
+    assert result.success is success and result.judged_by == "operator"
+
+
+def test_marking_success_while_adapting_cancels_the_adaptation_and_ends_the_trial():
+    desk = Desk(policy=Forward(speed=0.01), horizon=5, adapting_seconds=30.0, headless=False)
+    desk.when(lambda: desk.state is State.ADAPTING, lambda: desk.inbox.put(Intent.MARK_SUCCESS))
+    began = time.monotonic()
+    (result,) = desk.session.run()
+    assert time.monotonic() - began < 10
+    assert result.success and result.judged_by == "operator" and result.attempts == 1
+
+
+def test_skip_ends_the_trial_without_a_retry():
+    desk = Desk(policy=Forward(speed=0.01), horizon=500, headless=False, trials=2)
+    desk.when(desk.moving, lambda: desk.inbox.put(Intent.SKIP_TRIAL))
+    desk.when(lambda: desk.session.board.trial == 2 and desk.moving(), lambda: desk.inbox.put(Intent.QUIT))
+    first, second = desk.session.run()
+    assert (first.attempts, first.success, first.judged_by) == (1, False, "operator")
+    assert second.attempts == 0, "an attempt cut off by quitting has no outcome"
+    assert desk.method.adapted_attempts == []
+
+
+def test_observations_stale_for_a_moment_hold_the_arm_and_motion_resumes_by_itself():
+    desk = Desk(policy=Forward(speed=0.1), horizon=60, attempts=1)
+
+    def stall():
+        desk.robot.freeze_stamp = time.monotonic()
+        time.sleep(0.5)
+        desk.robot.freeze_stamp = None
+
+    desk.when(desk.moving, stall)
+    (result,) = desk.session.run()
+    assert result.judged_by in ("twin", "horizon")
+    assert desk.statistics.stale_holds == 1
+    assert any(isinstance(r, Hold) and "stale" in r.reason for r in desk.robot.requests)
+
+
+@pytest.mark.parametrize("trouble", ["stale", "silent", "arm", "nan"])
+def test_trouble_is_a_fault_that_ends_a_headless_session_with_an_error(trouble):
+    desk = Desk(policy=Forward(speed=0.01, poison=8 if trouble == "nan" else None), horizon=1000,
+                freshness=Freshness(limit=0.3))  # fmt: skip
+
+    def strike():
+        if trouble == "stale":
+            desk.robot.freeze_stamp = time.monotonic()
+        elif trouble == "silent":
+            desk.robot.silent = True
+        elif trouble == "arm":
+            desk.robot.latch("arm error C31: collision", fault=True)
+
+    desk.when(desk.moving, strike)
+    message = {"stale": "no fresh observation", "silent": "hardware server", "arm": "C31", "nan": "non-finite action"}
+    with pytest.raises(SessionFault, match=message[trouble]):
+        desk.session.run()
+    (attempt,) = desk.session._attempts
+    assert attempt.outcome.judged_by is Judge.FAULT and len(attempt.steps) > 3
+    (result,) = desk.session.results
+    assert not result.success and result.judged_by == "fault"
+
+
+def test_an_operator_clears_a_fault_and_the_trial_goes_on():
+    desk = Desk(headless=False, attempts=2)
+    desk.when(desk.moving, lambda: desk.robot.latch("arm error C31: collision", fault=True))
+    desk.when(lambda: desk.state is State.FAULT, lambda: (time.sleep(0.1), desk.inbox.put(Intent.RESUME)))
+    (result,) = desk.session.run()
+    assert result.success and result.attempts == 2
+    assert desk.method.adapted_attempts == [1], "an arm fault is a failure to learn from"
