@@ -86,9 +86,8 @@ def test_select_pairs_each_positive_with_its_own_state():
 def test_random_choice_neither_filters_nor_ranks():
     """The paper's ablation: K plain samples."""
     chunks = chunks_at([0.0, 9.0, 0.5])
-    pairs = select(
-        chunks, torch.zeros(1, 2), torch.zeros(1, H, A), by_first_entry, PairsConfig(choose="random", candidates=3, positives=2)
-    )  # fmt: skip
+    config = PairsConfig(choose="random", candidates=3, positives=2)
+    pairs = select(chunks, torch.zeros(1, 2), torch.zeros(1, H, A), by_first_entry, config)
     assert pairs.positives[:, 1, 2].tolist() == [0.0, 9.0]
     assert pairs.empty_states == 0
 
