@@ -1,0 +1,104 @@
+"""Demonstrations on disk (robomimic's HDF5 layout) and in memory.
+
+    data/demo_N                 attrs: num_samples, seed, success
+        actions (N, 7)   rewards (N,)   dones (N,)
+        obs/front_image, obs/wrist_image (N, S, S, 3) uint8
+        obs/robot0_eef_pos (N, 3)  obs/robot0_eef_quat (N, 4) xyzw  obs/robot0_gripper (N, 1)  obs/object (N, K)
+    data attrs: total, env_args (JSON with env_name, type, env_kwargs)
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from far_app.errors import RecordingError
+from far_app.types import Observation
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """One demonstration or rollout as arrays, N ticks."""
+
+    images: dict[str, UInt8[np.ndarray, "N S S 3"]]
+    states: Float[np.ndarray, "N 8"]
+    """End-effector position, quaternion (xyzw), gripper opening."""
+    actions: Float[np.ndarray, "N 7"]
+    rewards: Float[np.ndarray, "N"]
+    """The task's shaped reward in [0, 1] at each tick."""
+    successes: Bool[np.ndarray, "N"]
+    """The task's own check at each tick."""
+    success: bool
+    seed: int
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+def write_episode(path: Path, episode: Episode, objects: Float[np.ndarray, "N K"], env_args: dict[str, object]) -> None:
+    """Append one demonstration to a file (made on first use)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "a") as file:
+        data = file.require_group("data")
+        data.attrs["env_args"] = json.dumps(env_args)
+        group = data.create_group(f"demo_{len(data)}")
+        group.attrs.update({"num_samples": len(episode), "seed": episode.seed, "success": episode.success})
+        group["actions"] = episode.actions.astype(np.float32)
+        group["rewards"] = episode.rewards.astype(np.float32)
+        group["dones"] = episode.successes.astype(np.int8)
+        obs = group.create_group("obs")
+        for camera, frames in episode.images.items():
+            obs.create_dataset(f"{camera}_image", data=frames, chunks=(1, *frames.shape[1:]), compression="lzf")
+        obs["robot0_eef_pos"] = episode.states[:, :3]
+        obs["robot0_eef_quat"] = episode.states[:, 3:7]
+        obs["robot0_gripper"] = episode.states[:, 7:]
+        obs["object"] = objects.astype(np.float32)
+        data.attrs["total"] = int(data.attrs.get("total", 0)) + len(episode)
+
+
+def count_episodes(path: Path) -> int:
+    """Demonstrations already in a file; 0 when there is none."""
+    if not path.exists():
+        return 0
+    with h5py.File(path, "r") as file:
+        return len(file["data"]) if "data" in file else 0
+
+
+def read_episodes(path: Path, cameras: tuple[str, ...], limit: int | None = None) -> list[Episode]:
+    """The first `limit` demonstrations, decoded."""
+    if not path.exists():
+        raise RecordingError(f"no demonstrations at {path}; make some with `far demo --task lift --n 60`")
+    episodes = []
+    with h5py.File(path, "r") as file:
+        names = sorted(file["data"], key=lambda name: int(name.removeprefix("demo_")))[:limit]
+        for name in names:
+            group = file["data"][name]
+            missing = [c for c in cameras if f"{c}_image" not in group["obs"]]
+            if missing:
+                raise RecordingError(f"{path}:{name} has no images of {', '.join(missing)}; it has {list(group['obs'])}")
+            states = np.concatenate(
+                [group["obs"][k][:] for k in ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper")], axis=1
+            )
+            episodes.append(Episode(
+                images={c: group["obs"][f"{c}_image"][:] for c in cameras}, states=states.astype(np.float32),
+                actions=group["actions"][:], rewards=group["rewards"][:], successes=group["dones"][:].astype(bool),
+                success=bool(group.attrs["success"]), seed=int(group.attrs["seed"]),
+            ))  # fmt: skip
+    return episodes
+
+
+def episode_of(observations: list[Observation], actions: list[np.ndarray], success: bool, seed: int) -> Episode:
+    """Arrays of what was seen and done: one observation for each action."""
+    cameras = tuple(observations[0].images)
+    states = [np.concatenate([o.eef.position, o.eef.quaternion, [o.gripper]]) for o in observations]
+    return Episode(
+        images={c: np.stack([o.images[c] for o in observations]) for c in cameras},
+        states=np.stack(states).astype(np.float32), actions=np.stack(actions).astype(np.float32),
+        rewards=np.array([o.reward for o in observations], np.float32),
+        successes=np.array([bool(o.success) for o in observations]), success=success, seed=seed,
+    )  # fmt: skip

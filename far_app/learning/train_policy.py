@@ -1,0 +1,231 @@
+"""Behaviour cloning: the diffusion policy from demonstrations (paper, Training).
+
+A batch is segments of consecutive ticks, so that a light encoder sees each frame once though two histories share it,
+and each history is noised `draws` times. Random shifts of a few pixels are the only augmentation. Seeds give
+repeatable runs on CPU; a run killed at any moment goes on from its last saved state.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+import logging
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from far_app.errors import ConfigError, PolicyError
+from far_app.learning.dataset import Episode
+from far_app.learning.diffusion import TRAIN_STEPS, add_noise
+from far_app.learning.policy import DiffusionPolicy, PolicyConfig, save_policy
+from far_app.learning.resume import load_state, optimizer_tensors, restore_optimizer, save_state
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyTraining:
+    """How to train; the defaults of `paper` are its hyperparameter table."""
+
+    iterations: int = 30_000
+    batch: int = 128
+    """Histories an iteration."""
+    segment: int = 4
+    """Consecutive ticks a segment; 1 gives independent histories."""
+    draws: int = 1
+    """(k, ε) draws for each history."""
+    lr: float = 1e-4
+    lr_end: float = 1e-5
+    warmup: int = 100
+    weight_decay: float = 1e-6
+    shift: int = 4
+    """Largest random shift of the pictures, pixels."""
+    ema_power: float = 0.75
+    seed: int = 0
+    log_every: int = 100
+    save_every: int = 500
+
+    def __post_init__(self) -> None:
+        if self.batch % self.segment:
+            raise ConfigError(f"batch {self.batch} is not a multiple of segment {self.segment}")
+
+
+TRAININGS = {
+    "paper": PolicyTraining(),
+    "quickstart": PolicyTraining(iterations=6_000, batch=96, draws=2, lr=5e-4, lr_end=2e-5),
+}
+
+
+class DemonstrationArrays:
+    """All demonstrations in memory, pictures padded for random shifts, addressed by (episode, tick)."""
+
+    def __init__(self, episodes: Sequence[Episode], config: PolicyConfig, shift: int) -> None:
+        if not episodes:
+            raise ConfigError("no demonstrations to train on; make some with `far demo`")
+        self.config, self.shift = config, shift
+        self.lengths = np.array([len(e) for e in episodes])
+        self.starts = np.concatenate([[0], np.cumsum(self.lengths)[:-1]])
+        pad = ((0, 0), (shift, shift), (shift, shift), (0, 0))
+        self.images = {
+            c: np.concatenate([np.pad(e.images[c], pad, mode="edge") for e in episodes]) for c in config.cameras
+        }
+        self.states = np.concatenate([e.states for e in episodes])
+        self.actions = np.concatenate([e.actions for e in episodes])
+        self.ends = np.repeat(self.starts + self.lengths - 1, self.lengths)
+        """Row of the last tick of each row's episode."""
+
+    def segments(
+        self, count: int, length: int, rng: np.random.Generator
+    ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+        """`count` segments of `length` ticks: frames (count, length + n_obs − 1, S, S, 3), states, chunks
+        (count, length, H, A). Ticks before an episode's first repeat it, actions past its last repeat it."""
+        n_obs, horizon, size = self.config.n_obs, self.config.horizon, self.config.image_size
+        rows = rng.integers(0, len(self.ends), count)
+        first = np.searchsorted(self.starts, rows, side="right") - 1
+        start = np.minimum(rows, np.maximum(self.ends[rows] - length + 1, self.starts[first]))
+        span = np.arange(-(n_obs - 1), length)
+        frames = np.clip(start[:, None] + span, self.starts[first][:, None], self.ends[rows][:, None])
+        offsets = rng.integers(0, 2 * self.shift + 1, (count, 2))
+        images = {c: torch.from_numpy(self._cropped(a, frames, offsets, size)) for c, a in self.images.items()}
+        ticks = frames[:, n_obs - 1 :]
+        index = np.minimum(ticks[..., None] + np.arange(horizon), self.ends[rows][:, None, None])
+        return images, torch.from_numpy(self.states[frames]), torch.from_numpy(self.actions[index])
+
+    @staticmethod
+    def _cropped(array: np.ndarray, frames: np.ndarray, offsets: np.ndarray, size: int) -> np.ndarray:
+        out = np.empty((*frames.shape, size, size, 3), np.uint8)
+        for i, (dy, dx) in enumerate(offsets):
+            out[i] = array[frames[i], dy : dy + size, dx : dx + size]
+        return out
+
+
+def segment_features(policy: DiffusionPolicy, images: dict[str, Tensor], states: Tensor) -> Tensor:
+    """Features of every history in a batch of segments, (count · length, F); each frame is encoded once where the
+    encoder shares its weights over the frames."""
+    encoder, n_obs = policy.encoder, policy.config.n_obs
+    count, frames = states.shape[:2]
+    length = frames - n_obs + 1
+    normalised = policy.normalizer(states)
+    windows = [slice(t, t + length) for t in range(n_obs)]
+    state = torch.stack([normalised[:, w].flatten(0, 1) for w in windows], dim=1)
+    if encoder.per_frame:
+        parts = [[encoder.camera_features(c, t, images[c][:, w].flatten(0, 1)) for c in encoder.camera_names]
+                 for t, w in enumerate(windows)]  # fmt: skip
+    else:
+        once = {c: encoder.camera_features(c, 0, images[c].flatten(0, 1)).unflatten(0, (count, frames))
+                for c in encoder.camera_names}  # fmt: skip
+        parts = [[once[c][:, w].flatten(0, 1) for c in encoder.camera_names] for w in windows]
+    return encoder.join(parts, state)
+
+
+def denoising_loss(policy: DiffusionPolicy, features: Tensor, chunks: Tensor, generator: torch.Generator, draws: int) -> Tensor:
+    """E ‖ε − ε_θ(a_k, s, k)‖², averaged over entries."""
+    chunks, features = chunks.repeat(draws, 1, 1), features.repeat(draws, 1)
+    k = torch.randint(0, TRAIN_STEPS, (len(chunks),), generator=generator).to(chunks.device)
+    noise = torch.randn(chunks.shape, generator=generator).to(chunks.device)
+    return (policy.denoiser(add_noise(chunks, noise, k), k, features) - noise).square().mean()
+
+
+def learning_rate(config: PolicyTraining, iteration: int) -> float:
+    """Linear warm-up, then cosine from lr to lr_end."""
+    if iteration < config.warmup:
+        return config.lr * (iteration + 1) / config.warmup
+    progress = (iteration - config.warmup) / max(1, config.iterations - config.warmup)
+    return config.lr_end + (config.lr - config.lr_end) * 0.5 * (1.0 + math.cos(math.pi * progress))
+
+
+def train_policy(
+    episodes: Sequence[Episode], config: PolicyConfig, training: PolicyTraining, folder: Path, device: str = "cpu",
+    card: dict[str, object] | None = None, imagenet: dict[str, Tensor] | None = None,
+) -> Path:
+    """Train (or go on training) in a folder; returns the checkpoint (EMA weights). One line per interval in log.jsonl."""
+    torch.manual_seed(training.seed)
+    rng = np.random.default_rng(training.seed)
+    generator = torch.Generator().manual_seed(training.seed)
+    policy = DiffusionPolicy(config)
+    if imagenet is not None:
+        load_imagenet(policy, imagenet)
+    arrays = DemonstrationArrays(episodes, config, training.shift)
+    policy.normalizer.fit(arrays.states)
+    policy.to(device)
+    ema = copy.deepcopy(policy).requires_grad_(False)
+    optimizer = torch.optim.AdamW(
+        policy.parameters(), lr=training.lr, betas=(0.95, 0.999), weight_decay=training.weight_decay
+    )
+    state_path = folder / "state.safetensors"
+    done = 0
+    if state_path.exists():
+        tensors, notes = load_state(state_path)
+        if notes["training"] != dataclasses.asdict(training):
+            raise ConfigError(f"{folder} holds a run with other settings; choose another --out or delete it")
+        policy.load_state_dict({k[7:]: v for k, v in tensors.items() if k.startswith("policy.")})
+        ema.load_state_dict({k[4:]: v for k, v in tensors.items() if k.startswith("ema.")})
+        restore_optimizer(optimizer, tensors)
+        rng.bit_generator.state = notes["rng"]
+        generator.set_state(tensors["generator"])
+        done = int(notes["iteration"])  # type: ignore[call-overload]
+        log.info("going on from iteration %d of %s", done, folder)
+
+    def save(iteration: int) -> None:
+        tensors = {f"policy.{k}": v for k, v in policy.state_dict().items()}
+        tensors |= {f"ema.{k}": v for k, v in ema.state_dict().items()}
+        tensors |= optimizer_tensors(optimizer) | {"generator": generator.get_state()}
+        save_state(state_path, tensors, {
+            "iteration": iteration, "rng": rng.bit_generator.state, "training": dataclasses.asdict(training),
+        })  # fmt: skip
+
+    folder.mkdir(parents=True, exist_ok=True)
+    started, losses = time.monotonic(), []
+    bar = tqdm(range(done, training.iterations), initial=done, total=training.iterations, unit="it", desc="policy")
+    for iteration in bar:
+        lr = learning_rate(training, iteration)
+        for group in optimizer.param_groups:
+            group["lr"] = lr
+        images, states, chunks = arrays.segments(training.batch // training.segment, training.segment, rng)
+        images = {c: v.to(device, non_blocking=True) for c, v in images.items()}
+        features = segment_features(policy, images, states.to(device))
+        loss = denoising_loss(policy, features, chunks.flatten(0, 1).to(device), generator, training.draws)
+        if not torch.isfinite(loss):
+            raise PolicyError(
+                f"the loss became {loss.item()} at iteration {iteration}; the last good state is {state_path}; "
+                "lower --lr and start again"
+            )
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        decay = 1.0 - (1 + iteration) ** -training.ema_power
+        with torch.no_grad():
+            torch._foreach_lerp_(list(ema.parameters()), list(policy.parameters()), 1.0 - decay)
+        losses.append(loss.item())
+        if (iteration + 1) % training.log_every == 0 or iteration + 1 == training.iterations:
+            mean = float(np.mean(losses))
+            bar.set_postfix(loss=f"{mean:.4f}")
+            line = {"iteration": iteration + 1, "loss": mean, "lr": lr, "seconds": time.monotonic() - started}
+            with (folder / "log.jsonl").open("a") as file:
+                file.write(json.dumps(line) + "\n")
+            losses.clear()
+        if (iteration + 1) % training.save_every == 0 or iteration + 1 == training.iterations:
+            save(iteration + 1)
+    checkpoint = folder / "policy.safetensors"
+    save_policy(ema.eval(), checkpoint, (card or {}) | {
+        "training": dataclasses.asdict(training), "demonstrations": len(episodes),
+        "ticks": int(arrays.lengths.sum()), "seconds": time.monotonic() - started,
+    })  # fmt: skip
+    return checkpoint
+
+
+def load_imagenet(policy: DiffusionPolicy, weights: dict[str, Tensor]) -> None:
+    """Put torchvision's ResNet-18 weights (IMAGENET1K_V1 state-dict names) into every camera's trunk."""
+    trunk = {k: v for k, v in weights.items() if not k.startswith("fc.")}
+    for nets in policy.encoder.nets.values():
+        for net in nets:  # type: ignore[attr-defined]
+            own = net.state_dict()
+            net.load_state_dict({k: trunk[k] if k in trunk and trunk[k].shape == v.shape else v for k, v in own.items()})
