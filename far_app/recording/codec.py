@@ -86,7 +86,7 @@ def codec(hint: Any) -> Codec:
 
 
 def _generic_codec(hint: Any) -> Codec:
-    origin: Any = typing.get_origin(hint)
+    origin = typing.get_origin(hint)
     arguments = typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         kinds = [argument for argument in arguments if argument is not types.NoneType]
@@ -107,7 +107,7 @@ def _generic_codec(hint: Any) -> Codec:
                 decode=lambda value: tuple(inner.decode(item) for item in value),
                 schema={"type": "array", "items": inner.schema},
             )
-    if isinstance(origin, type) and issubclass(origin, Mapping) and arguments[0] is str:
+    if origin in (Mapping, dict) and arguments[0] is str:
         inner = codec(arguments[1])
         return Codec(
             encode=lambda value: {str(key): inner.encode(item) for key, item in value.items()},

@@ -61,9 +61,12 @@ class AttemptRecording:
     adaptation: Adaptation | None
     frames: dict[str, int]
     """Camera name to the number of readable frames."""
+    abandoned: str
+    """Why the attempt ended without an outcome (skipped, quit, recording failed); "" when it was not abandoned."""
     closed: bool
     """The writer finished the file."""
     damaged: bool
+    """Bytes are there that cannot be trusted, beyond a torn end."""
     problems: tuple[str, ...]
     """What is missing or damaged, in words."""
     size: int
@@ -85,7 +88,8 @@ class AttemptRecording:
     def attempt(self) -> Attempt:
         """The value the loop handed over. Raises RecordingError when it never ended."""
         if self.header is None or self.final is None or self.outcome is None:
-            raise RecordingError(f"{self.path} holds no ended attempt: {'; '.join(self.problems) or 'no outcome'}")
+            why = "; ".join(self.problems) or f"it was abandoned: {self.abandoned}"
+            raise RecordingError(f"{self.path} holds no ended attempt: {why}")
         return Attempt(
             index=self.header.attempt, scene_seed=self.header.scene_seed, steps=self.steps, final=self.final,
             outcome=self.outcome, policy_version=self.header.policy_version,
@@ -174,11 +178,12 @@ class _Parts:
         chunks = self._values("/chunk", ActionChunk)
         events = self._values("/event", RecordedEvent)
         progress = self._values("/adaptation_step", AdaptationStep)
-        self._say_what_is_missing(steps, finals, outcomes, events)
+        abandonments = [event.text for event in events if event.event in ("attempt_abandoned", "recording_failed")]
+        self._say_what_is_missing(steps, finals, outcomes, abandoned=bool(abandonments))
         return AttemptRecording(
             path=self.path, header=self.header, steps=tuple(steps), chunks=tuple(chunks), events=tuple(events),
             final=finals[-1] if finals else None, outcomes=tuple(outcomes), adaptation_steps=tuple(progress),
-            adaptation=adaptations[-1] if adaptations else None,
+            adaptation=adaptations[-1] if adaptations else None, abandoned=abandonments[-1] if abandonments else "",
             frames={camera: len(frames) for camera, frames in self._frames.items()}, closed=self.found.closed,
             damaged=self.found.damaged or self._unreadable > 0, problems=tuple(self.problems), size=self.found.size,
         )  # fmt: skip
@@ -188,7 +193,7 @@ class _Parts:
         steps: list[Step],
         finals: list[Observation],
         outcomes: list[Outcome],
-        events: list[RecordedEvent],
+        abandoned: bool,
     ) -> None:
         say = self.problems.append
         if self.header is None:
@@ -200,10 +205,9 @@ class _Parts:
             say(f"{self._missing_frames} frames that steps refer to are missing")
         if self._unreadable:
             say(f"{self._unreadable} messages do not fit their schema")
-        if not outcomes:
-            abandoned = [event.text for event in events if event.event in ("attempt_abandoned", "recording_failed")]
-            say(f"no outcome: {abandoned[-1] if abandoned else 'the attempt was cut off'}")
-        elif not finals:
+        if not outcomes and not abandoned:
+            say("the outcome is missing: the attempt was cut off")
+        elif outcomes and not finals:
             say("the final observation is missing")
         if not self.found.closed:
             say("the file was not closed")

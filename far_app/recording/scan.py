@@ -75,6 +75,14 @@ def scan(path: Path) -> Scan:
     )  # fmt: skip
 
 
+def ends_in_order(path: Path) -> bool:
+    """Whether the file ends as a finished one does; looks at its last bytes only."""
+    with open(path, "rb") as file:
+        file.seek(0, 2)
+        file.seek(max(0, file.tell() - len(MCAP0_MAGIC)))
+        return file.tell() > 0 and file.read() == MCAP0_MAGIC
+
+
 class _Walk:
     """One pass over the bytes."""
 
