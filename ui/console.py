@@ -20,6 +20,7 @@ from far_app.session_states import Intent, State
 from far_app.telemetry import Telemetry, View
 from far_app.types import RobotMode
 from ui import html
+from ui.page_server import Presses
 from ui.plot_model import change_plot, value_plot
 from ui.scene3d import BRAND, FLAGGED, Scene3D
 from ui.stop import StopLine
@@ -81,6 +82,7 @@ class Console:
         self.refusal = ""
         """Why the page itself refused the last press."""
         self._gui, self._stop, self._latest, self._viewer = server.gui, stop_line, latest, viewer
+        self._presses = Presses(server)
         self._refused_at = 0.0
         self._beats = 0
         self._images: dict[str, viser.GuiImageHandle] = {}
@@ -103,14 +105,8 @@ class Console:
         self._stop_note = gui.add_html(html.stop_note(None, False, ""))
         hotkey = gui.add_command("STOP the arm", description="Latches the arm at once", hotkey="space")
 
-        @stop.on_click
-        async def _(_: object) -> None:
-            self._press_stop("page: button")
-
-        @hotkey.on_trigger
-        async def _(_: object) -> None:
-            self._press_stop("page: space key")
-
+        self._presses.on(stop, lambda: self._press_stop("page: button"))
+        self._presses.on(hotkey, lambda: self._press_stop("page: space key"))
         places = [_place(stop, (0.7, 0.7, 22.3, 8.6)), _big(stop)]
         places += [self._add_control(button) for button in _BUTTONS]
         self._adapt = gui.add_html(html.adaptation(adaptation(None)))
@@ -124,18 +120,11 @@ class Console:
     def _add_control(self, button: _Button) -> str:
         handle = self._gui.add_button(button.label, disabled=True, color=button.color)
 
-        @handle.on_click
-        async def _(_: object) -> None:
-            self._press(button.intent)
-
+        self._presses.on(handle, lambda: self._press(button.intent))
         command = None
         if button.key is not None:
             command = self._gui.add_command(button.label, hotkey=button.key, disabled=True)
-
-            @command.on_trigger
-            async def _(_: object) -> None:
-                self._press(button.intent, by_key=True)
-
+            self._presses.on(command, lambda: self._press(button.intent, by_key=True))
         self._controls[button.intent] = (button, handle, command)
         return _place(handle, button.box)
 
@@ -192,6 +181,12 @@ class Console:
         else:
             self._refuse(intent, asked.reason)
 
+    @staticmethod
+    def _hint(button: _Button, telemetry: Telemetry | None) -> str:
+        if button.intent is Intent.RESUME and telemetry is not None and telemetry.state is not State.PAUSED:
+            return "the arm may move"
+        return f"key {button.key}" if button.key else ""
+
     def _refuse(self, intent: Intent, reason: str) -> None:
         self.refusal = f"{intent.value.replace('_', ' ')} refused: {reason}"
         self._refused_at = time.monotonic()
@@ -209,7 +204,7 @@ class Console:
         self._stop_note.content = html.stop_note(self._stop.result, latched, status.reason if status else "")
         for intent, (button, handle, command) in self._controls.items():
             now = control(intent, telemetry, fresh)
-            line = (f"key {button.key}" if button.key else "") if now.enabled else now.reason
+            line = self._hint(button, telemetry) if now.enabled else now.reason
             handle.disabled, handle.label = not now.enabled, f"{button.label}\n{line}"
             if command is not None:
                 command.disabled = not now.enabled

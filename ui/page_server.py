@@ -12,7 +12,7 @@ import ipaddress
 import logging
 import re
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import viser
@@ -26,7 +26,9 @@ MAX_MESSAGE = 2**18
 
 
 def open_page(host: str, port: int) -> viser.ViserServer:
-    """A running server on exactly this address. Raises ConfigError when it is not loopback or the port is taken."""
+    """A running server on exactly this address; give it Presses at once.
+
+    Raises ConfigError when the address is not loopback or the port is taken."""
     listener = _listen(host, port)
     bound = int(listener.getsockname()[1])
     logging.getLogger("websockets.server").setLevel(logging.ERROR)
@@ -35,7 +37,6 @@ def open_page(host: str, port: int) -> viser.ViserServer:
     if server.get_port() != bound:
         server.stop()
         raise ConfigError(f"the page's server moved to port {server.get_port()} instead of {bound}; stop what holds it")
-    _only_clicks(server)
     return server
 
 
@@ -89,17 +90,30 @@ def _serving(listener: socket.socket, port: int) -> Iterator[None]:
         websocket_server.serve = original  # type: ignore[assignment]
 
 
-def _only_clicks(server: viser.ViserServer) -> None:
-    """Of all a client may say to viser, keep button clicks and hotkeys; refuse anything but `value` in a click."""
-    wire = server._websock_server
-    keep = {messages.GuiUpdateMessage, messages.CommandTriggerMessage}
-    for kind in list(wire._incoming_handlers):
-        if kind not in keep:
+class Presses:
+    """What buttons and hotkeys do, by viser's ids; actions run on viser's event loop, so they must only enqueue.
+
+    Goes past viser's own dispatch on purpose: that one needs a rendered 3D camera before a client may click, runs
+    callbacks on a pool that can fill up, and writes whatever fields a client's message names.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._actions: dict[str, Callable[[], None]] = {}
+        wire = server._websock_server
+        for kind in list(wire._incoming_handlers):
             wire.unregister_handler(kind)
-    wire.unregister_handler(messages.GuiUpdateMessage)
+        wire.register_handler(messages.GuiUpdateMessage, self._click)
+        wire.register_handler(messages.CommandTriggerMessage, self._hotkey)
 
-    async def click(client: Any, message: messages.GuiUpdateMessage) -> None:
-        if set(message.updates) == {"value"}:
-            await server.gui._handle_gui_updates(client, message)
+    def on(self, handle: viser.GuiButtonHandle | viser.CommandHandle, action: Callable[[], None]) -> None:
+        self._actions[handle._impl.uuid] = action
 
-    wire.register_handler(messages.GuiUpdateMessage, click)
+    def _click(self, _client: Any, message: messages.GuiUpdateMessage) -> None:
+        action = self._actions.get(message.uuid)
+        if action is not None and message.updates == {"value": True}:
+            action()
+
+    def _hotkey(self, _client: Any, message: messages.CommandTriggerMessage) -> None:
+        action = self._actions.get(message.uuid)
+        if action is not None:
+            action()

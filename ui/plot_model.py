@@ -75,7 +75,8 @@ def change_plot(telemetry: Telemetry | None) -> ChangePlot:
         at = [tick for tick in telemetry.flagged if 0 <= tick < len(changes)]
         flagged[at] = change[at]
         threshold = telemetry.threshold
-    frame = _frame(np.append(change, 0.0), length)
+    around_zero = [0.0] if len(changes) else [-0.1, 0.1]
+    frame = _frame(np.append(change, around_zero), length)
     return ChangePlot(
         tick=np.arange(length, dtype=float),
         change=change,

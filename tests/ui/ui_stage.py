@@ -1,7 +1,7 @@
 """A test source: plays the app and the hw server towards the page with real Telemetry, View and STOP messages.
 
 What it sends has the shape of a real run but is made up; run it by hand to look at the page:
-python tests/ui/stage.py DIR [--scenes]
+python tests/ui/ui_stage.py DIR [--scenes]
 """
 
 from __future__ import annotations

@@ -1,0 +1,224 @@
+"""The page in a real headless Chromium: what an operator sees, presses, and is warned of."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import PageProcess, wait_until
+from ui_stage import Stage, adapting, running, stopped
+
+from far_app.session_states import Intent, State
+from far_app.types import RobotMode
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright (the dev extra)")
+CHROMIUM = Path("/usr/bin/chromium")
+ARGUMENTS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
+
+pytestmark = [
+    pytest.mark.page,
+    pytest.mark.skipif(not CHROMIUM.exists(), reason="no /usr/bin/chromium: apt-get install chromium"),
+]
+Start = Callable[..., PageProcess]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=str(CHROMIUM), args=ARGUMENTS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def tab(browser: Any, start_page: Start, stage: Stage) -> Iterator[Any]:
+    """An open page that shows the test source's running attempt; requests that leave the machine are recorded."""
+    process = start_page("--no-scene3d")
+    page = browser.new_page(viewport={"width": 1280, "height": 720})
+    page.requests = []
+    page.on("request", lambda request: page.requests.append(request.url))
+    page.goto(process.url)
+    page.wait_for_selector("#op-state[data-state='RUNNING']", timeout=30_000)
+    yield page
+    page.close()
+
+
+def button(page: Any, label: str) -> Any:
+    return page.get_by_role("button", name=re.compile(f"^{label}"))
+
+
+def test_the_state_is_shown_and_followed(tab: Any, stage: Stage) -> None:
+    stage.telemetry = adapting()
+    tab.wait_for_selector("#op-state[data-state='LEARNING'][data-attempt='2']")
+    assert "6 of 10" in tab.inner_text("#op-adapt")
+    assert "not solved" in tab.inner_text("#op-history")
+    stage.telemetry = running(12, 3)
+    tab.wait_for_selector("#op-state[data-state='RUNNING'][data-attempt='3'][data-tick='12']")
+
+
+def test_stop_latches_by_click_and_by_space(tab: Any, stage: Stage) -> None:
+    button(tab, "STOP").click()
+    assert wait_until(lambda: len(stage.stops) == 1)
+    tab.wait_for_selector("#op-stop:has-text('latched in')")
+    tab.keyboard.press("Space")
+    assert wait_until(lambda: len(stage.stops) >= 2)
+    assert stage.stops[-1].source == "page: space key"
+
+
+def test_space_stops_and_does_not_press_the_focused_button(tab: Any, stage: Stage) -> None:
+    pause = button(tab, "Pause")
+    pause.click()
+    assert wait_until(lambda: [i.intent for i in stage.intents] == [Intent.PAUSE])
+    tab.keyboard.press("Space")
+    assert wait_until(lambda: len(stage.stops) == 1)
+    tab.wait_for_selector("#op-stop:has-text('latched in')")
+    assert [i.intent for i in stage.intents if i.intent is not Intent.STOP] == [Intent.PAUSE]
+
+
+@pytest.mark.parametrize(
+    ("label", "key", "intent"),
+    [
+        ("Pause", "p", Intent.PAUSE),
+        ("Mark success", "s", Intent.MARK_SUCCESS),
+        ("Mark failure", "f", Intent.MARK_FAILURE),
+        ("Skip trial", "k", Intent.SKIP_TRIAL),
+        ("End session", None, Intent.QUIT),
+    ],
+)
+def test_every_live_control_sends_its_intent(
+    tab: Any, stage: Stage, label: str, key: str | None, intent: Intent
+) -> None:
+    button(tab, label).click()
+    assert wait_until(lambda: [i.intent for i in stage.intents] == [intent])
+    if key is not None:
+        tab.keyboard.press(key)
+        assert wait_until(lambda: [i.intent for i in stage.intents] == [intent, intent])
+
+
+def test_dead_controls_are_disabled_and_say_why(tab: Any, stage: Stage) -> None:
+    assert button(tab, "Resume").is_disabled()
+    assert "nothing is held" in button(tab, "Resume").inner_text()
+    stage.telemetry = stopped()
+    tab.wait_for_selector("#op-state[data-state='STOPPED']")
+    assert button(tab, "Mark success").is_disabled()
+    assert "Resume first" in button(tab, "Mark success").inner_text()
+    button(tab, "Resume").click()
+    assert wait_until(lambda: [i.intent for i in stage.intents] == [Intent.RESUME])
+
+
+def test_after_a_stop_resume_takes_a_click_not_a_stray_key(tab: Any, stage: Stage) -> None:
+    stage.telemetry = stopped()
+    tab.wait_for_selector("#op-state[data-state='STOPPED']")
+    tab.keyboard.press("r")
+    tab.wait_for_selector("#op-loop:has-text('click it')")
+    assert stage.intents == []
+    stage.telemetry = replace(running(), state=State.PAUSED, allowed=(Intent.RESUME,))
+    tab.wait_for_selector("#op-state[data-state='PAUSED']")
+    tab.keyboard.press("r")
+    assert wait_until(lambda: [i.intent for i in stage.intents] == [Intent.RESUME])
+
+
+def test_the_overlay_rises_when_the_ui_process_dies_and_falls_when_it_returns(
+    browser: Any, stage: Stage, start_page: Start
+) -> None:
+    process = start_page("--no-scene3d")
+    page = browser.new_page(viewport={"width": 1280, "height": 720})
+    page.goto(process.url)
+    page.wait_for_selector("#op-state[data-state='RUNNING']", timeout=30_000)
+    opacity = "getComputedStyle(document.querySelector('#op-dead')).opacity"
+    page.wait_for_timeout(3000)
+    assert page.evaluate(opacity) == "0"
+    process.kill()
+    page.wait_for_function(f"() => {opacity} === '1'")
+    assert "NO LIVE DATA" in page.inner_text("#op-dead")
+    stage.telemetry = running(5, 4)
+    start_page("--no-scene3d")
+    page.wait_for_selector("#op-state[data-attempt='4']", timeout=30_000)
+    page.wait_for_function(f"() => {opacity} === '0'")
+    page.close()
+
+
+def test_the_overlay_names_a_silent_app(tab: Any, stage: Stage) -> None:
+    stage.telemetry = None
+    tab.wait_for_selector("#op-state[data-state='APP SILENT']")
+    tab.wait_for_selector("#op-dead.now:has-text('APP SILENT')")
+    assert button(tab, "Pause").is_disabled()
+    button(tab, "STOP").click()
+    assert wait_until(lambda: len(stage.stops) == 1)
+
+
+def test_flagged_chunks_are_shaded_in_the_value_plot(tab: Any, stage: Stage) -> None:
+    stage.telemetry = adapting()
+    tab.wait_for_selector("#op-state[data-state='LEARNING']")
+    script = """() => Object.values(window.__viserTestpoints.uplots).map(u =>
+        ({data: u.chart.data.map(a => Array.from(a)), x: [u.chart.scales.x.min, u.chart.scales.x.max],
+          y: [u.chart.scales.y.min, u.chart.scales.y.max]}))"""
+    tab.wait_for_function("() => Object.values(window.__viserTestpoints.uplots).some(u => u.chart.data[1][90] === 1)")
+    value, change = tab.evaluate(script)
+    flagged = adapting().flagged
+    shaded = [tick for tick, on in enumerate(value["data"][1]) if on]
+    assert shaded[0] == flagged[0]
+    assert shaded[-1] == flagged[-1] + adapting().chunk_horizon
+    for plot in (value, change):
+        assert plot["x"] == [0, 150]
+        assert plot["y"][0] < plot["y"][1]
+
+
+def test_live_pictures_reach_the_page(tab: Any) -> None:
+    script = """async () => { const image = [...document.querySelectorAll('img')].find(i => i.naturalWidth === 320);
+        if (!image) return null; const first = image.src; await new Promise(r => setTimeout(r, 1000));
+        const now = [...document.querySelectorAll('img')].find(i => i.naturalWidth === 320);
+        return now ? now.src !== first : null; }"""
+    assert wait_until(lambda: tab.evaluate(script) is True)
+
+
+def test_the_page_asks_nothing_of_the_outside(tab: Any) -> None:
+    outside = [u for u in tab.requests if not u.startswith(("http://127.0.0.1:", "data:", "blob:"))]
+    assert outside == []
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (1920, 1080), (1024, 768), (1600, 1200)])
+def test_nothing_is_clipped_or_covered(tab: Any, stage: Stage, width: int, height: int) -> None:
+    stage.telemetry = adapting()
+    tab.set_viewport_size({"width": width, "height": height})
+    tab.wait_for_selector("#op-state[data-state='LEARNING']")
+    tab.wait_for_timeout(500)
+    boxes = tab.evaluate(
+        """() => { const cells = ['#op-state', '#op-stop', '#op-adapt', '#op-history', '#op-events', '#op-loop']
+            .map(s => document.querySelector(s).parentElement)
+            .concat([...document.querySelectorAll('button.mantine-Button-root')].map(b => b.parentElement)
+                .filter(e => e.getBoundingClientRect().width > 0 && getComputedStyle(e).visibility === 'visible'))
+            .concat([...document.querySelectorAll('.uplot-container')]);
+          return cells.map(e => { const r = e.getBoundingClientRect();
+            return [r.left, r.top, r.right, r.bottom, (e.innerText || '').slice(0, 20)]; }); }"""
+    )
+    for left, top, right, bottom, text in boxes:
+        assert -1 <= left < right <= width + 1, text
+        assert -1 <= top < bottom <= height + 1, text
+    for i, a in enumerate(boxes):
+        for b in boxes[i + 1 :]:
+            across = min(a[2], b[2]) - max(a[0], b[0])
+            down = min(a[3], b[3]) - max(a[1], b[1])
+            assert across <= 1 or down <= 1, (a[4], b[4])
+
+
+def test_a_second_browser_that_comes_late_sees_everything(tab: Any, browser: Any, stage: Stage) -> None:
+    stage.telemetry = adapting()
+    tab.wait_for_selector("#op-state[data-state='LEARNING']")
+    late = browser.new_page(viewport={"width": 1280, "height": 720})
+    late.goto(tab.url)
+    late.wait_for_selector("#op-state[data-state='LEARNING']", timeout=30_000)
+    assert "6 of 10" in late.inner_text("#op-adapt")
+    late.close()
+    stage.mode = RobotMode.HOMING
+    tab.wait_for_selector("#op-state:has-text('arm goes home')")
