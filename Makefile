@@ -1,0 +1,30 @@
+# make run      set up what is missing, then start the application:  make run ARGS="--trials 1 --headless"
+# make test     set up what is missing, then run all tests
+# make lint     ruff and pyright
+# Set-up needs the network once; it is skipped while its inputs are unchanged (stamps in .venv).
+
+VENV := .venv
+INPUTS := pyproject.toml constraints.txt scripts/set-up
+export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/cache/numba
+export PYTHONUNBUFFERED := 1
+
+.PHONY: run test lint
+
+run: $(VENV)/.ready-run
+	@$(VENV)/bin/far run $(ARGS)
+
+test: $(VENV)/.ready-test
+	$(VENV)/bin/python -m pytest $(ARGS)
+
+lint: $(VENV)/.ready-test
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/pyright
+
+$(VENV)/.ready-run: $(INPUTS)
+	@PYTHON="$(PYTHON)" scripts/set-up run
+	@touch $@
+
+$(VENV)/.ready-test: $(INPUTS)
+	@PYTHON="$(PYTHON)" scripts/set-up test
+	@touch $@ $(VENV)/.ready-run

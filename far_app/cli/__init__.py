@@ -1,0 +1,65 @@
+"""The console script `far`: one line per subcommand here, each in its own module, imported only when it is called."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from far_app.errors import FarError
+
+COMMANDS: dict[str, tuple[str, str]] = {
+    "run": ("far_app.cli.run", "supervised trials: try, notice failure, learn, retry; with the operator page"),
+    "demo": ("far_app.cli.demo", "make demonstrations with the scripted expert"),
+    "train policy": ("far_app.cli.train_policy", "train the diffusion policy on demonstrations"),
+    "train critic": ("far_app.cli.train_critic", "train the IQL critic on demonstrations"),
+    "eval": ("far_app.cli.evaluate", "compare ways to retry, in lockstep, over many scenes"),
+    "inspect": ("far_app.cli.inspect", "what a recorded session holds, and what is missing or damaged"),
+    "replay": ("far_app.cli.replay", "open a recorded attempt or session in the rerun viewer"),
+    "bench loop": ("far_app.bench.loop", "lateness of the 30 Hz loop, idle and adapting"),
+    "bench infer": ("far_app.bench.infer", "milliseconds per chunk, by preset"),
+    "bench adapt": ("far_app.bench.adapt", "seconds from a failed attempt to a new policy version, by stage"),
+    "doctor": ("far_app.cli.doctor", "what this machine has, and what to do about what it lacks"),
+}
+
+
+def usage() -> str:
+    lines = [f"  far {name:<14} {summary}" for name, (_, summary) in COMMANDS.items()]
+    return "\n".join(
+        [
+            "FAR: supervised trials of learned robot policies that notice failure, learn from it and try again.",
+            "",
+            *lines,
+            "",
+            "far COMMAND --help lists a command's options. --debug shows the traceback of an error.",
+        ]
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exit status: 0 done, 2 an error in one line on stderr, 130 interrupted."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    words = [w for w in words if w != "--debug"]
+    name = next((n for n in (" ".join(words[:2]), " ".join(words[:1])) if n in COMMANDS), None)
+    if name is None:
+        if not words or words[0] in ("-h", "--help", "help"):
+            print(usage())
+            return 0
+        group = [n for n in COMMANDS if n.startswith(f"{words[0]} ")]
+        known = ", ".join(group or COMMANDS)
+        print(f"far: unknown command '{' '.join(words[:2] if group else words[:1])}'; choose: {known}", file=sys.stderr)
+        return 2
+    try:
+        module = importlib.import_module(COMMANDS[name][0])
+        return int(module.main(words[len(name.split()) :]) or 0)
+    except FarError as error:
+        if debug:
+            raise
+        print(f"far: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        if debug:
+            raise
+        print("far: interrupted", file=sys.stderr)
+        return 130

@@ -1,0 +1,90 @@
+"""Puts a method together from its parts: checkpoints, critic, device, retry settings. The CLI alone composes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from far_app.config import RetryConfig, TaskConfig
+from far_app.errors import CheckpointError, ConfigError
+from far_app.protocols import Method, PolicySpec
+from far_app.types import Observation
+
+CHECKPOINTS = Path(__file__).parent.parent / "checkpoints"
+"""The shipped quickstart model: {task}.policy.safetensors and {task}.critic.safetensors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parts:
+    """A method ready to run."""
+
+    method: Method
+    policy_name: str
+    """Checkpoint, for people and the recording."""
+    max_attempts: int | None
+    """Attempts a trial where the method fixes them."""
+
+
+def shipped(task: str, kind: str) -> Path:
+    """Where the quickstart model of a task lies; kind is "policy" or "critic"."""
+    return CHECKPOINTS / f"{task}.{kind}.safetensors"
+
+
+def assemble(
+    method: str, task: TaskConfig, policy: str | None, critic: Path | None, device: str, retry: RetryConfig
+) -> Parts:
+    """Load what a method needs and warm it up. Raises ConfigError or CheckpointError."""
+    if policy is not None and policy.startswith("test:"):
+        from far_app.cli._scripted import ScriptedMethod
+
+        return Parts(method=ScriptedMethod(policy.removeprefix("test:")), policy_name=policy, max_attempts=None)
+
+    from far_app.learning.critic_file import load_critic
+    from far_app.learning.policy import load_policy
+    from far_app.learning.runtime import ActingPolicy
+    from far_app.methods import METHODS, Ingredients
+    from far_app.methods import method as make_method
+
+    if method not in METHODS:
+        raise ConfigError(f"unknown method '{method}'; choose one of: {', '.join(METHODS)}")
+    entry = METHODS[method]
+    check_device(device)
+    path = Path(policy) if policy is not None else shipped(task.name, "policy")
+    network = load_policy(path, task.name, device)
+    critic_path = critic or (shipped(task.name, "critic") if policy is None else path.with_name("critic.safetensors"))
+    critic_network = load_critic(critic_path, network) if entry.needs_critic or critic_path.exists() else None
+    made = make_method(
+        method,
+        Ingredients(
+            network=network, critic=critic_network, config=retry,
+            act=lambda net, version: ActingPolicy(net, version, critic_network),
+        ),
+    )  # fmt: skip
+    return Parts(method=made, policy_name=str(path), max_attempts=entry.attempts)
+
+
+def check_device(device: str) -> None:
+    """Raises ConfigError when torch has no such device."""
+    import torch
+
+    if device != "cpu" and not (device.startswith("cuda") and torch.cuda.is_available()):
+        raise ConfigError(
+            f"device '{device}' was asked for, but torch {torch.__version__} sees no CUDA GPU; use --device cpu, or "
+            "install a CUDA build of torch and NVIDIA's driver"
+        )
+
+
+def check_observation(spec: PolicySpec, observation: Observation) -> None:
+    """What the policy needs to see against what the robot shows, before the first motion. Raises CheckpointError."""
+    for camera in spec.cameras:
+        image = observation.images.get(camera)
+        if image is None:
+            raise CheckpointError(
+                f"policy {spec.name} looks through camera '{camera}', the robot shows "
+                f"{', '.join(observation.images) or 'none'}; give the checkpoint or the rig that belongs to it"
+            )
+        if image.shape[:2] != (spec.image_size, spec.image_size):
+            raise CheckpointError(
+                f"policy {spec.name} was trained on {spec.image_size}×{spec.image_size} pictures, camera '{camera}' "
+                f"gives {image.shape[1]}×{image.shape[0]}; set policy_image in the rig file or give another checkpoint"
+            )
