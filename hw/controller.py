@@ -112,6 +112,10 @@ class ArmController:
         """Latch. Any thread, any time: a plain assignment that the next servo tick acts on before all else."""
         self._stop_reason = reason or "STOP"
 
+    def fail(self, reason: str) -> None:
+        """Latch by a fault that others noticed: a lost camera, a dead servo loop."""
+        self._latch(reason, fault=True)
+
     def take_acks(self) -> tuple[Ack, ...]:
         """The acknowledgments since last asked."""
         acks, self._acks = self._acks, []

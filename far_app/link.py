@@ -1,0 +1,196 @@
+"""The robot behind sockets: far_app.protocols.Robot for an app whose arm lives in the hw server's process.
+
+A thread reads every observation, keeps the newest and gathers the acknowledgments of all, so that a busy app misses
+pictures but never an acknowledgment. Targets and requests go out on sockets of their own: a request that waits for its
+reply never holds up a target.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from dataclasses import replace
+
+import zmq
+
+from far_app.endpoints import Endpoints, Reply
+from far_app.errors import RobotError
+from far_app.protocols import Heartbeat, Hold, Request, Reset
+from far_app.types import Ack, Observation, Target
+from far_app.wire import WireError, pack, unpack
+
+log = logging.getLogger(__name__)
+
+SILENCE = 1.0
+"""Seconds without an observation after which the robot counts as lost."""
+REQUEST_TIMEOUT = 1.0
+RESET_TIMEOUT = 10.0
+POLL = 0.1
+"""Seconds between looks at whether the link was closed."""
+
+
+class RemoteRobot:
+    """A Robot on the other side of a set of endpoints. observe() is for one thread; send() and request() for any."""
+
+    def __init__(self, endpoints: Endpoints, connect_timeout: float = 30.0) -> None:
+        """Waits for the first observation; raises RobotError when none comes within connect_timeout seconds."""
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._endpoints = endpoints
+        self._targets = self._dealer(send_limit=16)
+        self._requests = self._dealer(send_limit=16)
+        self._targets_lock, self._requests_lock = threading.Lock(), threading.Lock()
+        self._news = threading.Condition()
+        self._newest: Observation | None = None
+        self._handed: Observation | None = None
+        self._acks: list[Ack] = []
+        self._reply: Reply | None = None
+        self._request_number = 0
+        self._heard = time.monotonic()
+        self._closed = False
+        self.drops = 0
+        """Observations published but never received."""
+        self.unsent = 0
+        """Targets and heartbeats that found the socket full (the hw server is gone or stuck)."""
+        self.damaged = 0
+        """Messages that could not be read."""
+        self._thread = threading.Thread(target=self._receive, name="observations", daemon=True)
+        self._thread.start()
+        with self._news:
+            if not self._news.wait_for(lambda: self._newest is not None, connect_timeout):
+                self._closed = True
+        if self._closed:
+            self._thread.join()
+            self._context.destroy(linger=0)
+            raise RobotError(
+                f"no observation from the hw server at {endpoints.observations} within {connect_timeout:.0f} s; "
+                "see its own log for why"
+            )
+
+    def _dealer(self, send_limit: int) -> zmq.Socket[bytes]:
+        socket = self._context.socket(zmq.DEALER)
+        socket.setsockopt(zmq.SNDHWM, send_limit)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.connect(self._endpoints.commands)
+        return socket
+
+    # ── observations ──
+
+    def _receive(self) -> None:
+        socket = self._context.socket(zmq.SUB)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.RCVHWM, 256)
+        socket.subscribe(b"")
+        socket.connect(self._endpoints.observations)
+        while not self._closed:
+            if not socket.poll(int(1000 * POLL)):
+                continue
+            raw = socket.recv()
+            try:
+                observation = unpack(raw)
+            except WireError as error:
+                observation = error
+            if isinstance(observation, Observation):
+                self._take(observation)
+            else:
+                self.damaged += 1
+                log.warning("not an observation: %s", observation)
+        socket.close()
+
+    def _take(self, observation: Observation) -> None:
+        with self._news:
+            if self._newest is not None:
+                self.drops += max(0, observation.seq - self._newest.seq - 1)
+            self._newest = observation
+            self._acks.extend(observation.acks)
+            self._heard = time.monotonic()
+            self._news.notify_all()
+
+    def observe(self) -> Observation:
+        with self._news:
+            newest, reply = self._newest, self._reply
+            silence = time.monotonic() - self._heard
+            if self._closed or newest is None or silence > SILENCE:
+                raise RobotError(
+                    f"no observation from the hw server for {silence:.1f} s (limit {SILENCE} s): it died, hangs or "
+                    "was cut off; the arm holds by its watchdog; see the hw server's log, then start again"
+                )
+            if newest is not self._handed or self._acks:
+                self._observation = replace(newest, acks=tuple(self._acks))
+                self._acks, self._handed = [], newest
+        if reply is not None and newest.seq <= reply.seq:
+            return replace(self._observation, status=reply.status)
+        return self._observation
+
+    def age(self) -> float:
+        """Seconds since the newest observation's pictures were captured; inf before the first."""
+        newest = self._newest
+        return math.inf if newest is None else time.monotonic() - newest.stamp
+
+    def silence(self) -> float:
+        """Seconds since anything at all came from the hw server."""
+        return time.monotonic() - self._heard
+
+    # ── commands ──
+
+    def send(self, target: Target) -> None:
+        self._tell(target)
+
+    def request(self, request: Request) -> None:
+        if isinstance(request, Heartbeat):
+            self._tell(request)
+            return
+        limit = RESET_TIMEOUT if isinstance(request, Reset) else REQUEST_TIMEOUT
+        reply = self._ask(request, limit)
+        if reply.error:
+            raise RobotError(reply.error)
+        with self._news:
+            self._reply = reply
+
+    def _tell(self, message: Target | Heartbeat) -> None:
+        with self._targets_lock:
+            if self._closed:
+                raise RobotError("this link to the hw server was closed; make another")
+            try:
+                self._targets.send(pack(message), zmq.NOBLOCK)
+            except zmq.Again:
+                self.unsent += 1
+
+    def _ask(self, request: Request, limit: float) -> Reply:
+        name = type(request).__name__
+        with self._requests_lock:
+            if self._closed:
+                raise RobotError("this link to the hw server was closed; make another")
+            self._request_number += 1
+            number = str(self._request_number).encode()
+            deadline = time.monotonic() + limit
+            try:
+                self._requests.send_multipart([number, pack(request)], zmq.NOBLOCK)
+                while self._requests.poll(max(0, int(1000 * (deadline - time.monotonic())))):
+                    answered, raw = self._requests.recv_multipart()
+                    if answered == number:  # else the late answer to a request that was given up
+                        reply = unpack(raw)
+                        assert isinstance(reply, Reply), f"a {type(reply).__name__} in place of a Reply"
+                        return reply
+            except zmq.Again:
+                pass
+        raise RobotError(
+            f"the hw server did not answer {name} within {limit:.0f} s; it may hang or be gone: see its log, and use "
+            "the physical emergency stop where there is one"
+        )
+
+    def close(self) -> None:
+        if self._closed:
+            return
+        try:
+            if self.silence() < SILENCE:
+                self.request(Hold(reason="the app let go of the arm"))
+        except RobotError as error:
+            log.warning("letting go: %s", error)
+        with self._targets_lock, self._requests_lock:
+            self._closed = True
+            self._targets.close()
+            self._requests.close()
+        self._thread.join(timeout=2.0)
+        self._context.destroy(linger=0)

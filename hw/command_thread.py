@@ -1,0 +1,136 @@
+"""What the app tells the arm: targets and heartbeats (not replied), requests (replied), and the scene's geometry."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+
+import zmq
+
+from far_app.endpoints import Endpoints, Reply
+from far_app.errors import RobotError
+from far_app.protocols import Heartbeat, Hold, Home, Reset, Resume
+from far_app.telemetry import GeometryRequest, SceneGeometry
+from far_app.types import Target
+from far_app.wire import WireError, pack, unpack
+from hw.priority import PROMPT_NICENESS, nice
+from hw.publisher_thread import PublisherThread
+from hw.servo_thread import ServoThread
+
+log = logging.getLogger(__name__)
+
+PATIENCE_MS = 50
+"""Longest wait for a message before looking whether to close."""
+BUSY_MS = 2
+"""The same while a scene reset is under way."""
+
+
+class CommandThread:
+    """Serves commands and geometry until closed."""
+
+    def __init__(
+        self, servo: ServoThread, publisher: PublisherThread, geometry: Callable[[], SceneGeometry | None],
+        context: zmq.Context[zmq.Socket[bytes]], endpoints: Endpoints,
+    ) -> None:  # fmt: skip
+        self._servo, self._publisher, self._geometry = servo, publisher, geometry
+        self._context, self._endpoints = context, endpoints
+        self._closing = False
+        self._pending: list[tuple[Future[None], list[bytes]]] = []
+        self.damaged = 0
+        """Messages that could not be read or do not belong here."""
+        self._bound = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="commands", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+        if not self._bound.wait(5.0):
+            raise RobotError(f"cannot serve commands at {self._endpoints.commands}; is another hw server running?")
+
+    def close(self) -> None:
+        self._closing = True
+        self._thread.join(timeout=2.0)
+
+    def _run(self) -> None:
+        nice(PROMPT_NICENESS)
+        self._commands = self._context.socket(zmq.ROUTER)
+        geometry = self._context.socket(zmq.REP)
+        for socket, endpoint in ((self._commands, self._endpoints.commands), (geometry, self._endpoints.geometry)):
+            socket.setsockopt(zmq.LINGER, 0)
+            socket.bind(endpoint)
+        self._bound.set()
+        poller = zmq.Poller()
+        poller.register(self._commands, zmq.POLLIN)
+        poller.register(geometry, zmq.POLLIN)
+        while not self._closing:
+            ready = dict(poller.poll(BUSY_MS if self._pending else PATIENCE_MS))
+            if self._commands in ready:
+                self._serve(self._commands.recv_multipart())
+            if geometry in ready:
+                self._answer_geometry(geometry)
+            self._finish_resets()
+        self._commands.close()
+        geometry.close()
+
+    def _serve(self, parts: list[bytes]) -> None:
+        try:
+            message = unpack(parts[-1])
+        except WireError as error:
+            return self._damaged(f"{error}", parts)
+        if len(parts) == 2 and isinstance(message, Target | Heartbeat):
+            self._take(message)
+        elif len(parts) == 3 and isinstance(message, Home | Hold | Resume | Heartbeat | Reset):
+            self._request(parts[:2], message)
+        else:
+            self._damaged(f"a {type(message).__name__} in {len(parts) - 1} parts does not belong here", parts)
+
+    def _take(self, message: Target | Heartbeat) -> None:
+        with self._servo.locked() as controller:
+            if isinstance(message, Target):
+                controller.offer(message, time.monotonic())
+            else:
+                controller.request(message, time.monotonic())
+        if isinstance(message, Target):
+            self._publisher.wake()
+
+    def _request(self, address: list[bytes], request: Home | Hold | Resume | Heartbeat | Reset) -> None:
+        if isinstance(request, Reset):
+            self._pending.append((self._servo.reset(request.seed), address))
+            return
+        try:
+            with self._servo.locked() as controller:
+                controller.request(request, time.monotonic())
+        except RobotError as error:
+            self._reply(address, str(error))
+        else:
+            self._reply(address)
+
+    def _finish_resets(self) -> None:
+        for future, address in [p for p in self._pending if p[0].done()]:
+            error = future.exception()
+            self._reply(address, str(error) if error is not None else "")
+        self._pending = [p for p in self._pending if not p[0].done()]
+
+    def _reply(self, address: list[bytes], error: str = "") -> None:
+        with self._servo.locked() as controller:
+            reply = Reply(error=error, status=controller.status(), seq=self._publisher.seq)
+        self._commands.send_multipart([*address, pack(reply)], zmq.NOBLOCK)
+        self._publisher.wake()
+
+    def _damaged(self, why: str, parts: list[bytes]) -> None:
+        self.damaged += 1
+        log.warning("refused a message: %s", why)
+        if len(parts) == 3:
+            self._reply(parts[:2], f"refused: {why}")
+
+    def _answer_geometry(self, socket: zmq.Socket[bytes]) -> None:
+        try:
+            request = unpack(socket.recv())
+        except WireError as error:
+            log.warning("refused a geometry request: %s", error)
+            request = None
+        geometry = self._geometry()
+        known = isinstance(request, GeometryRequest) and geometry is not None
+        socket.send(pack(geometry) if known else b"", zmq.NOBLOCK)

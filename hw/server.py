@@ -1,0 +1,179 @@
+"""The hw server: the process that owns the arm and the cameras. `python -m hw.server --folder F --parent PID`.
+
+    servo thread     plant, controller, safety filter, watchdog; nothing else touches the arm
+    camera thread    draws; View to the page
+    publisher        Observation to the app
+    command thread   targets, heartbeats, requests, geometry
+    stop thread      STOP, on its own context
+
+One line of JSON on standard output says {"ready": …}, or {"error": …, "kind": …} before a non-zero exit. Ends by
+SIGTERM or SIGINT, and by itself when its parent dies; the arm is held first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+os.environ.setdefault("LP_NUM_THREADS", "1")  # before any GL: software drawing would take every core
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import cv2
+import zmq
+
+from far_app.config import TaskConfig
+from far_app.endpoints import Endpoints
+from far_app.errors import ConfigError, FarError, RobotError
+from far_app.protocols import Hold
+from far_app.tasks import task as task_named
+from hw.camera_thread import CameraThread
+from hw.command_thread import CommandThread
+from hw.controller import ArmController
+from hw.plant import Plant, PlantView
+from hw.publisher_thread import PublisherThread
+from hw.rig import RigConfig, load_rig
+from hw.servo_thread import ServoThread
+from hw.stop_thread import StopThread
+
+log = logging.getLogger(__name__)
+
+LOOK = 0.1
+"""Seconds between looks at the parent and the threads."""
+SOCKET_NAME = 107
+"""Bytes the operating system allows in a socket's name."""
+BRAKING = 0.3
+"""Seconds given to the arm to stand still before the process goes."""
+
+
+def make_plant(rig: RigConfig, task: TaskConfig) -> tuple[Plant, Callable[[], PlantView]]:
+    """The plant of a rig, and how to make its view (in the camera thread)."""
+    if rig.robot != "twin":
+        raise ConfigError(f"rig {rig.name} drives a robot of kind '{rig.robot}'; this server knows: twin")
+    from hw.twin import TwinPlant
+    from hw.twin_view import TwinView
+
+    plant = TwinPlant(rig, task)
+    xml, base = plant.model_xml(), plant.base_pose()
+    return plant, lambda: TwinView(xml, base)
+
+
+class Server:
+    """All threads of the hw server around one plant."""
+
+    def __init__(self, rig: RigConfig, task: TaskConfig, endpoints: Endpoints) -> None:
+        self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self.plant, make_view = make_plant(rig, task)
+        controller = ArmController(rig, task, self.plant.servo_hz, self.plant.measure())
+        self.servo = ServoThread(self.plant, controller, camera_rate=task.rate)
+        self.publisher = PublisherThread(self.servo, self.context, endpoints.observations, task.rate)
+        self.cameras = CameraThread(
+            make_view, rig, task, self.servo, self.context, endpoints.view, self.publisher.pictures, self._lost
+        )
+        self.commands = CommandThread(
+            self.servo, self.publisher, lambda: self.cameras.geometry, self.context, endpoints
+        )
+        self.stop = StopThread(self.servo, endpoints.stop)
+
+    def _lost(self, reason: str) -> None:
+        with self.servo.locked() as controller:
+            controller.fail(reason)
+
+    def start(self) -> None:
+        """Returns when everything runs; raises a FarError where it cannot."""
+        self.stop.start()
+        self.servo.start()
+        self.cameras.start()
+        self.publisher.start()
+        self.commands.start()
+
+    def close(self, reason: str) -> None:
+        """Hold the arm, give it time to stand still, end the threads."""
+        with self.servo.locked() as controller:
+            controller.request(Hold(reason=reason), time.monotonic())
+        if self.servo.alive:
+            time.sleep(BRAKING)
+        for part in (self.commands, self.cameras, self.publisher, self.stop, self.servo):
+            part.close()
+        self.context.destroy(linger=0)
+
+
+def wait_for_the_end(parent: int | None) -> str:
+    """Sleeps until a signal or the parent's death; returns why to end."""
+    ended = threading.Event()
+    reasons: list[str] = []
+
+    def on_signal(number: int, frame: object) -> None:
+        reasons.append(f"the hw server was told to end ({signal.Signals(number).name})")
+        ended.set()
+
+    signal.signal(signal.SIGTERM, on_signal)
+    signal.signal(signal.SIGINT, on_signal)
+    while not ended.wait(LOOK):
+        if parent is not None and os.getppid() != parent:
+            return "the app is gone"
+    return reasons[0]
+
+
+def serve(
+    folder: Path, rig: str, task: TaskConfig, parent: int | None, say: Callable[[dict[str, object]], None]
+) -> None:
+    """Runs the server to its end."""
+    began = time.monotonic()
+    longest = len(str(folder / "observations").encode())
+    if longest > SOCKET_NAME:
+        raise ConfigError(
+            f"sockets below {folder} need names of {longest} bytes, at most {SOCKET_NAME} fit; choose a shorter folder"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        server = Server(load_rig(rig), task, Endpoints.in_folder(folder))
+        server.start()
+    except zmq.ZMQError as error:
+        raise RobotError(f"cannot serve below {folder}: {error}; choose another folder") from error
+    say({
+        "ready": True, "pid": os.getpid(), "servo_hz": server.plant.servo_hz, "cameras": list(task.cameras),
+        "scheduling": server.servo.scheduling, "seconds": round(time.monotonic() - began, 2),
+    })  # fmt: skip
+    why = wait_for_the_end(parent)
+    log.info("ending: %s", why)
+    server.close(why)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m hw.server", description="Own the arm and its cameras.")
+    parser.add_argument("--folder", type=Path, required=True, help="where the ipc endpoints lie")
+    parser.add_argument("--rig", default="twin", help="a rig's name or the path of its TOML file")
+    parser.add_argument("--task", default="lift")
+    parser.add_argument("--parent", type=int, default=None, help="end when this process is no longer our parent")
+    options = parser.parse_args(arguments)
+    handshake = os.fdopen(os.dup(1), "w")  # standard output stays ours; what libraries print goes to standard error
+    os.dup2(2, 1)
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    sys.setswitchinterval(0.0005)
+    cv2.setNumThreads(1)
+
+    def say(words: dict[str, object]) -> None:
+        handshake.write(json.dumps(words) + "\n")
+        handshake.flush()
+
+    try:
+        serve(options.folder, options.rig, task_named(options.task), options.parent, say)
+    except FarError as error:
+        log.error("%s", error)
+        say({"error": str(error), "kind": type(error).__name__})
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    code = main()
+    logging.shutdown()
+    os._exit(code)  # daemon threads inside a GL driver must not delay the end

@@ -1,0 +1,157 @@
+"""The servo thread: the only one that touches the plant. Absolute deadlines; after a late tick it re-anchors.
+
+Everything else talks to it through `locked` (the controller, for a moment), `newest` (what it last measured) and `call`
+(something to run between two ticks: a scene reset).
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from far_app.errors import FarError
+from hw.cameras import Moment
+from hw.controller import ArmController
+from hw.plant import Measured, Plant
+from hw.priority import real_time
+
+log = logging.getLogger(__name__)
+
+RE_ANCHOR = 0.5
+"""Lateness, as a share of a servo period, from which the schedule starts anew instead of catching up."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Newest:
+    """What the servo thread last knew."""
+
+    measured: Measured
+    stamp: float
+    moment: Moment
+    """The newest snapshot for the cameras."""
+
+
+class ServoThread:
+    """Runs a controller on a plant at plant.servo_hz."""
+
+    def __init__(self, plant: Plant, controller: ArmController, camera_rate: float) -> None:
+        self._plant, self._controller = plant, controller
+        self._lock = threading.Lock()
+        self._calls: queue.SimpleQueue[tuple[Callable[[], None], Future[None]]] = queue.SimpleQueue()
+        self._per_picture = max(1, round(plant.servo_hz / camera_rate))
+        self._closing = False
+        self._snapped = threading.Condition()
+        now = time.monotonic()
+        first = Moment(snapshot=plant.snapshot(), stamp=now, seq=0)
+        self.newest = Newest(measured=controller.measured, stamp=now, moment=first)
+        self.scheduling = ""
+        """How the thread is scheduled: "fifo", "nice" or "normal"."""
+        self.ticks = self.re_anchored = 0
+        self.lateness = np.zeros(1 << 14)
+        """Seconds late, of the last 16384 ticks, as a ring."""
+        self._thread = threading.Thread(target=self._run, name="servo", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    @property
+    def alive(self) -> bool:
+        return self._thread.is_alive()
+
+    @contextmanager
+    def locked(self) -> Iterator[ArmController]:
+        """The controller, for as short as possible."""
+        with self._lock:
+            yield self._controller
+
+    def stop(self, reason: str) -> None:
+        """Latch at the next servo tick, whoever holds the lock."""
+        self._controller.stop(reason)
+
+    def call(self, work: Callable[[], None]) -> Future[None]:
+        """Run this in the servo thread, between two ticks."""
+        future: Future[None] = Future()
+        self._calls.put((work, future))
+        return future
+
+    def reset(self, seed: int) -> Future[None]:
+        """Scene and arm as the seed says."""
+
+        def work() -> None:
+            self._controller.refuse_latched("Reset")
+            self._plant.reset(seed)
+            with self._lock:
+                self._controller.reset(self._plant.measure(), seed)
+
+        return self.call(work)
+
+    def wait_for_moment(self, after: int, timeout: float) -> Moment | None:
+        """The newest snapshot, once there is one later than that number."""
+        with self._snapped:
+            if self._snapped.wait_for(lambda: self.newest.moment.seq > after, timeout):
+                return self.newest.moment
+        return None
+
+    def close(self) -> None:
+        self._closing = True
+        self._thread.join(timeout=2.0)
+
+    def _run(self) -> None:
+        self.scheduling = real_time()
+        log.info("servo thread at %d Hz, scheduling %s", self._plant.servo_hz, self.scheduling)
+        try:
+            self._loop(1.0 / self._plant.servo_hz)
+        except Exception as error:  # whatever the plant raises, the operator must read it
+            log.exception("the servo thread ended")
+            with self._lock:
+                self._controller.fail(f"the servo loop ended ({type(error).__name__}: {error}); restart the program")
+
+    def _loop(self, period: float) -> None:
+        deadline = time.monotonic() + period
+        while not self._closing:
+            now = time.monotonic()
+            if now < deadline:
+                time.sleep(deadline - now)
+                now = time.monotonic()
+            self.lateness[self.ticks % len(self.lateness)] = now - deadline
+            self.ticks += 1
+            if now - deadline > RE_ANCHOR * period:
+                self.re_anchored += 1
+                deadline = now
+            deadline += period
+            self._tick(now)
+            if not self._calls.empty():
+                self._answer_calls()
+                deadline = time.monotonic() + period
+
+    def _tick(self, now: float) -> None:
+        measured = self._plant.measure()
+        with self._lock:
+            pose, gripper = self._controller.tick(now, measured)
+        self._plant.servo(pose, gripper)
+        self._plant.advance()
+        moment = self.newest.moment
+        if self.ticks % self._per_picture == 0:
+            moment = Moment(snapshot=self._plant.snapshot(), stamp=time.monotonic(), seq=moment.seq + 1)
+        self.newest = Newest(measured=self._plant.measure(), stamp=time.monotonic(), moment=moment)
+        if self.ticks % self._per_picture == 0:
+            with self._snapped:
+                self._snapped.notify_all()
+
+    def _answer_calls(self) -> None:
+        while not self._calls.empty():
+            work, future = self._calls.get()
+            try:
+                work()
+            except FarError as error:
+                future.set_exception(error)
+            else:
+                future.set_result(None)
