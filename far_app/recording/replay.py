@@ -6,15 +6,18 @@ The drawing itself (blueprint, entities) is the operator interface's: whoever co
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import os
+import signal
 import socket
 import subprocess
-import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.parse import quote
 
 from far_app.errors import ConfigError, RecordingError
 from far_app.recording.inspect import find_session
@@ -76,50 +79,83 @@ def make_rrds(path: Path, write_rrd: WriteRrd) -> list[Path]:
     return made
 
 
-def open_viewer(rrds: Sequence[Path], *, web: bool = False, port: int = 9090) -> int:
-    """Shows the files in the rerun viewer, in a window or on a page at `port` of the loopback address; blocks until
-    it is closed and returns its exit status. Raises ConfigError when no viewer can open."""
-    _check_viewer(web, port, rrds)
-    with _quiet_configuration() as environment:
-        command = viewer_command(rrds, web=web, port=port)
+def open_viewer(
+    rrds: Sequence[Path], *, web: bool = False, port: int = 9090, announce: Callable[[str], None] = lambda url: None
+) -> None:
+    """Shows the files in the rerun viewer, in a window, or on a page at `port` of the loopback address whose URL goes
+    to `announce`. Blocks until the viewer is closed (Ctrl-C and SIGTERM close it). Raises ConfigError when no viewer
+    can open."""
+    _check_display(web, rrds)
+    if web:
+        _check_port(port)
+    data_port = _free_port()
+    with _quiet_configuration() as environment, _interrupted_by_sigterm():
+        viewer = subprocess.Popen(viewer_command(rrds, data_port, web_port=port if web else None), env=environment)
         try:
-            status = subprocess.run(command, env=environment, check=False).returncode
+            if web:
+                announce(viewer_url(port, data_port))
+            status = viewer.wait()
         except KeyboardInterrupt:
-            return 0
+            status = 0
+        finally:
+            viewer.terminate()
+            viewer.wait()
     if status:
         raise ConfigError(
             f"the rerun viewer ended with status {status}; "
             + (f"is port {port} free?" if web else "if this machine has no graphics, add --web")
         )
-    return status
 
 
-def viewer_command(rrds: Sequence[Path], *, web: bool, port: int) -> list[str]:
-    """The viewer's command line, bound to the loopback address."""
-    command = [sys.executable, "-m", "rerun_cli", *map(str, rrds), "--bind", LOOPBACK, "--port", str(_free_port())]
-    return [*command, "--serve-web", "--web-viewer-port", str(port)] if web else command
+def viewer_command(rrds: Sequence[Path], data_port: int, web_port: int | None) -> list[str]:
+    """The viewer's command line, bound to the loopback address; with a window when web_port is None."""
+    command = [str(_viewer_binary()), *map(str, rrds), "--bind", LOOPBACK, "--port", str(data_port)]
+    return command if web_port is None else [*command, "--serve-web", "--web-viewer-port", str(web_port)]
 
 
-def viewer_url(port: int) -> str:
-    return f"http://{LOOPBACK}:{port}"
+def viewer_url(port: int, data_port: int) -> str:
+    """The page, told where its data is."""
+    return f"http://{LOOPBACK}:{port}/?url={quote(f'rerun+http://{LOOPBACK}:{data_port}/proxy', safe='')}"
 
 
-def _check_viewer(web: bool, port: int, rrds: Sequence[Path]) -> None:
-    if not web and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        where = rrds[0].parent if len(rrds) == 1 else os.path.commonpath(rrds)
-        raise ConfigError(
-            "no viewer can open here: this machine has no display (DISPLAY and WAYLAND_DISPLAY are unset); add --web "
-            f"to see it in a browser, or copy the .rrd files from {where} to a machine that has one"
-        )
-    if web:
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((LOOPBACK, port))
-            except OSError as error:
-                raise ConfigError(
-                    f"port {port} cannot be used: {error.strerror}; choose another with --port"
-                ) from error
+def _viewer_binary() -> Path:
+    package = importlib.util.find_spec("rerun_cli")
+    binary = Path(package.origin).parent / "rerun" if package is not None and package.origin else Path("rerun")
+    if not binary.exists():
+        raise ConfigError("the rerun viewer is not installed; run: pip install rerun-sdk")
+    return binary
+
+
+@contextmanager
+def _interrupted_by_sigterm() -> Iterator[None]:
+    """SIGTERM ends the wait as Ctrl-C does, so that no viewer is left behind."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _check_display(web: bool, rrds: Sequence[Path]) -> None:
+    if web or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        return
+    where = rrds[0].parent if len(rrds) == 1 else os.path.commonpath(rrds)
+    raise ConfigError(
+        "no viewer can open here: this machine has no display (DISPLAY and WAYLAND_DISPLAY are unset); add --web "
+        f"to see it in a browser, or copy the .rrd files from {where} to a machine that has one"
+    )
+
+
+def _check_port(port: int) -> None:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError as error:
+            raise ConfigError(f"port {port} cannot be used: {error.strerror}; choose another with --port") from error
 
 
 @contextmanager
@@ -127,7 +163,7 @@ def _quiet_configuration() -> Iterator[dict[str, str]]:
     """An environment in which the viewer sends no usage data; the user's own settings stay as they are."""
     with tempfile.TemporaryDirectory(prefix="far_viewer_") as folder:
         environment = {**os.environ, "XDG_CONFIG_HOME": folder}
-        disable = [sys.executable, "-m", "rerun_cli", "analytics", "disable"]
+        disable = [str(_viewer_binary()), "analytics", "disable"]
         subprocess.run(disable, env=environment, capture_output=True, check=False, timeout=30)
         yield environment
 

@@ -121,6 +121,7 @@ class _Walk:
                 self._check_data(at, body)
             elif opcode == Opcode.FOOTER:
                 self.closed = self.raw[end:] == MCAP0_MAGIC
+                self._check_summary(at, body)
                 if not self.closed:
                     self._torn(end)
                 return
@@ -154,6 +155,13 @@ class _Walk:
         [expected] = struct.unpack_from("<I", body) if len(body) >= 4 else [0]
         if expected and not self.damaged and zlib.crc32(self.raw[:at]) != expected:
             self.damage("the file's checksum is wrong though every chunk's is right: an index or a header is damaged")
+
+    def _check_summary(self, at: int, body: bytes) -> None:
+        if len(body) != _FOOTER_BYTES - _HEAD.size:
+            return
+        start, _, expected = struct.unpack("<QQI", body)
+        if not 0 < start <= at or zlib.crc32(self.raw[start : at + _FOOTER_BYTES - 4]) != expected:
+            self.damage("the index at the file's end is damaged; the messages do not depend on it")
 
     def _read_footer(self) -> Footer | None:
         start = len(self.raw) - _FOOTER_BYTES - len(MCAP0_MAGIC)
