@@ -26,6 +26,7 @@ from far_app.errors import ConfigError, PolicyError
 from far_app.learning.adamw import FlatAdamW, guarded_step
 from far_app.learning.cancellation import Cancelled, check
 from far_app.learning.pairs import BATCH, Pairs
+from far_app.learning.trainable import Trainable, trainable
 from far_app.types import AdaptationStep
 
 AddNoise = Callable[[Float[Tensor, "B H A"], Float[Tensor, "B H A"], Int[Tensor, "B"]], Float[Tensor, "B H A"]]
@@ -84,7 +85,7 @@ def draw(rng: np.random.Generator, states: int, draws: int, diffusion_steps: int
 
 
 def denoising_errors(
-    denoiser: nn.Module,
+    denoiser: Trainable,
     noising: Noising,
     chunks: Float[Tensor, "N H A"],
     features: Float[Tensor, "S F"],
@@ -92,8 +93,9 @@ def denoising_errors(
     owner: Int[Tensor, "N"],
     reduction: str,
     cancelled: Cancelled,
-) -> Float[Tensor, "N"]:
-    """l_diff of each chunk in its owner's state: squared error summed (or averaged) over entries, mean over draws."""
+) -> list[Float[Tensor, "B"]]:
+    """Squared error, summed (or averaged) over entries, of every draw of every chunk in its owner's state: N · D rows,
+    a chunk's draws side by side, in batches. `per_chunk` makes l_diff of them."""
     per_state = draws.k.shape[1]
     state = owner.repeat_interleave(per_state)
     k, noise = draws.k[owner].flatten(), draws.noise[owner].flatten(0, 1)
@@ -101,10 +103,16 @@ def denoising_errors(
     errors = []
     for rows in torch.arange(len(noisy)).split(BATCH):
         check(cancelled)
-        predicted = denoiser(noisy[rows], k[rows], features[state[rows]])
+        here, row = state[rows].unique(return_inverse=True)
+        predicted = denoiser.run(noisy[rows], k[rows], denoiser.condition(features[here])[row])
         squared = (noise[rows] - predicted).square().flatten(1)
         errors.append(squared.sum(1) if reduction == "sum" else squared.mean(1))
-    return torch.cat(errors).reshape(-1, per_state).mean(1)
+    return errors
+
+
+def per_chunk(errors: list[Float[Tensor, "B"]], draws: int) -> Float[Tensor, "N"]:
+    """l_diff of each chunk: the mean over its draws, without gradients."""
+    return torch.cat([e.detach() for e in errors]).reshape(-1, draws).mean(1)
 
 
 def preference_loss(
@@ -131,14 +139,12 @@ class _Objective:
     """The preference loss of one set of pairs: its value on fixed draws, its gradients on fresh ones."""
 
     def __init__(
-        self, denoiser: nn.Module, noising: Noising, pairs: Pairs, config: FCPAConfig, cancelled: Cancelled
+        self, denoiser: Trainable, noising: Noising, pairs: Pairs, config: FCPAConfig, cancelled: Cancelled
     ) -> None:
         self.denoiser, self.noising, self.pairs, self.config = denoiser, noising, pairs, config
         self.cancelled = cancelled
-        self.parameters = [p for p in denoiser.parameters() if p.requires_grad]
-        self.size = sum(p.numel() for p in self.parameters)
 
-    def errors(self, chunks: Tensor, owner: Tensor, states: slice, draws: Draws) -> Tensor:
+    def errors(self, chunks: Tensor, owner: Tensor, states: slice, draws: Draws) -> list[Tensor]:
         here = Draws(k=draws.k[states], noise=draws.noise[states])
         return denoising_errors(
             self.denoiser, self.noising, chunks, self.pairs.features[states], here, owner, self.config.reduction,
@@ -148,41 +154,46 @@ class _Objective:
     @torch.no_grad()
     def report(self, draws: Draws) -> tuple[float, float, float]:
         """(loss, l⁺, l⁻), each a mean over pairs, on these draws."""
-        pairs = self.pairs
+        pairs, count = self.pairs, draws.k.shape[1]
         everything = slice(0, len(pairs.features))
-        winner = self.errors(pairs.positives, pairs.owner, everything, draws)
-        if self.config.objective == "awr":
-            loser = torch.full_like(winner, math.nan)
-        else:
-            loser = self.errors(pairs.negatives, torch.arange(len(pairs.negatives)), everything, draws)[pairs.owner]
+        winner = per_chunk(self.errors(pairs.positives, pairs.owner, everything, draws), count)
+        loser = torch.full_like(winner, math.nan)
+        if self.config.objective != "awr":
+            own = torch.arange(len(pairs.negatives))
+            loser = per_chunk(self.errors(pairs.negatives, own, everything, draws), count)[pairs.owner]
         loss = preference_loss(winner, loser, self.config, pairs.weights) / len(pairs)
         return float(loss), float(winner.mean()), float(loser.mean())
 
     def gradients(self, draws: Draws) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
         """(g⁺, g⁻): the loss's gradient through the positives' errors and through the negatives', flat; their sum is
-        the gradient of the loss. A positive share lowers l⁺, the other raises l⁻."""
-        need_winner = self.config.objective != "no_positive"
-        need_loser = self.config.objective in {"pairwise", "no_positive"}
-        g_winner, g_loser = torch.zeros(self.size), torch.zeros(self.size)
+        the gradient of the loss. Following −g⁺ lowers l⁺, following −g⁻ raises l⁻."""
+        count, objective = draws.k.shape[1], self.config.objective
+        totals = {side: [torch.zeros_like(leaf) for leaf in self.denoiser.leaves] for side in ("winner", "loser")}
         for states, rows in blocks(self.pairs):
             owner = self.pairs.owner[rows] - states.start
-            zeros = torch.zeros(len(owner))
-            winner = self.errors(self.pairs.positives[rows], owner, states, draws) if need_winner else zeros
-            negatives = self.pairs.negatives[states]
-            loser = self.errors(negatives, torch.arange(len(negatives)), states, draws)[owner] if need_loser else zeros
-            at_winner, at_loser = winner.detach().requires_grad_(), loser.detach().requires_grad_()
-            loss = preference_loss(at_winner, at_loser, self.config, self.pairs.weights[rows]) / len(self.pairs)
-            to_winner, to_loser = torch.autograd.grad(loss, (at_winner, at_loser), materialize_grads=True)
-            if need_winner:
-                g_winner += self.flat_gradient((winner * to_winner).sum())
-            if need_loser:
-                g_loser += self.flat_gradient((loser * to_loser).sum())
-        return g_winner, g_loser
+            own = torch.arange(states.stop - states.start)
+            winners, losers = [], []
+            winner = loser = torch.zeros(len(owner))
+            if objective != "no_positive":
+                winners = self.errors(self.pairs.positives[rows], owner, states, draws)
+                winner = per_chunk(winners, count)
+            if objective in {"pairwise", "no_positive"}:
+                losers = self.errors(self.pairs.negatives[states], own, states, draws)
+                loser = per_chunk(losers, count)[owner]
+            at = winner.requires_grad_(), loser.clone().requires_grad_()
+            loss = preference_loss(*at, self.config, self.pairs.weights[rows]) / len(self.pairs)
+            to_winner, to_loser = torch.autograd.grad(loss, at, materialize_grads=True)
+            self.accumulate(totals["winner"], winners, to_winner, count)
+            self.accumulate(totals["loser"], losers, torch.zeros(len(own)).index_add_(0, owner, to_loser), count)
+        return self.denoiser.pull_back(totals["winner"]), self.denoiser.pull_back(totals["loser"])
 
-    def flat_gradient(self, loss: Tensor) -> Float[Tensor, "P"]:
-        check(self.cancelled)
-        gradients = torch.autograd.grad(loss, self.parameters, materialize_grads=True)
-        return torch.cat([g.flatten() for g in gradients])
+    def accumulate(self, totals: list[Tensor], errors: list[Tensor], share: Float[Tensor, "N"], draws: int) -> None:
+        """Add the gradients of Σ share · l_diff, batch by batch."""
+        for error, weight in zip(errors, (share / draws).repeat_interleave(draws).split(BATCH), strict=False):
+            check(self.cancelled)
+            gradients = torch.autograd.grad((error * weight).sum(), self.denoiser.leaves, materialize_grads=True)
+            for total, gradient in zip(totals, gradients, strict=True):
+                total.add_(gradient)
 
     def cloning_gradient(self, demonstrations: Demonstrations, rng: np.random.Generator) -> Float[Tensor, "P"]:
         """Gradient of the behaviour-cloning loss on a minibatch of demonstration chunks."""
@@ -193,7 +204,9 @@ class _Objective:
             self.denoiser, self.noising, chunks, demonstrations.features[rows], draws, torch.arange(BC_BATCH),
             self.config.reduction, self.cancelled,
         )  # fmt: skip
-        return self.flat_gradient(errors.mean())
+        totals = [torch.zeros_like(leaf) for leaf in self.denoiser.leaves]
+        self.accumulate(totals, errors, torch.full((BC_BATCH,), 1 / BC_BATCH), 1)
+        return self.denoiser.pull_back(totals)
 
 
 def check_config(config: FCPAConfig, demonstrations: Demonstrations | None) -> None:
@@ -221,11 +234,12 @@ def adapt(
     Progress is told before the first step (step 0) and after each. Raises AdaptationCancelledError on cancellation;
     the copy is then of no use."""
     check_config(config, demonstrations)
-    objective = _Objective(denoiser, noising, pairs, config, cancelled)
     chunk = (pairs.negatives.shape[1], pairs.negatives.shape[2])
+    runner = trainable(denoiser, horizon=chunk[0])
+    objective = _Objective(runner, noising, pairs, config, cancelled)
     states = len(pairs.features)
     fixed = draw(rng, states, FIXED_DRAWS, noising.steps, chunk)
-    optimiser = FlatAdamW(objective.parameters, lr=config.lr)
+    optimiser = FlatAdamW(runner.parameters, lr=config.lr)
     start = optimiser.weights()
     history: list[AdaptationStep] = []
 
@@ -250,6 +264,7 @@ def adapt(
                 guarded_step(optimiser, g_winner, g_loser)
             else:
                 optimiser.step(g_winner + g_loser)
+            runner.refresh()
             winner = report(step).winner_error
             if config.guard in {"stop", "scale"} and winner > limit:
                 optimiser.set_weights(before)

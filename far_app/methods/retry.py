@@ -26,6 +26,7 @@ from far_app.learning.cancellation import AdaptationCancelledError, Cancelled, c
 from far_app.learning.critic import Critic
 from far_app.learning.pairs import Pairs, candidates, merged, select, weighted_trajectory
 from far_app.learning.policy import DiffusionPolicy
+from far_app.learning.trainable import trainable
 from far_app.methods.evidence import features, recorded_values, sent_chunks, values
 from far_app.perturbation import Perturbation, perturbation
 from far_app.protocols import Policy
@@ -183,16 +184,18 @@ class _Learning:
         noise = [self._rng("candidates", t).standard_normal(shape, dtype=np.float32) for t in ticks]
         self.note("encoding")
 
+        runner = trainable(method.acting.denoiser, spec.horizon, train=False)
+
         def denoiser(noisy: Tensor, k: Tensor, condition: Tensor) -> Tensor:
             check(self.cancelled)
-            return method.acting.denoiser(noisy, k, condition)
+            return runner.run(noisy, k, condition)
 
         def sample(condition: Tensor, start: Tensor) -> Tensor:
             return diffusion.ddim_sample(denoiser, condition, start, method.base.config.ddim_steps)
 
         with torch.no_grad():
             stacked = torch.from_numpy(np.stack(noise)) if noise else torch.zeros(0, *shape)
-            chunks = candidates(sample, seen, stacked, self.cancelled)
+            chunks = candidates(sample, runner.condition(seen), stacked, self.cancelled)
             if not bool(torch.isfinite(chunks).all()):
                 raise FarError(f"the policy {method.policy.version} sampled a non-finite candidate; nothing was learnt")
             self.note("candidates")

@@ -13,7 +13,9 @@ from far_app.config import FCPAConfig
 from far_app.errors import ConfigError
 from far_app.learning import diffusion, fcpa
 from far_app.learning.cancellation import AdaptationCancelledError, never
+from far_app.learning.fast_unet import FastUnet
 from far_app.learning.pairs import Pairs
+from far_app.learning.trainable import Trainable, trainable
 from far_app.learning.unet import ConditionalUnet1d
 
 H, A, F = 8, 7, 12
@@ -43,6 +45,10 @@ def run(config: FCPAConfig, pairs: Pairs | None = None, net: nn.Module | None = 
         kwargs.pop("progress", lambda step: None), **kwargs,
     )  # fmt: skip
     return net, update
+
+
+def runner(net: nn.Module) -> Trainable:
+    return trainable(net, horizon=H)
 
 
 def flat(net: nn.Module) -> torch.Tensor:
@@ -80,7 +86,7 @@ def test_loss_and_gradient_are_the_printed_formula(reduction):
     """Mean over pairs of −log σ(β [l(a⁻) − l(a⁺)]), with the same (k, ε) for a state's negative and positives."""
     net, pairs, config = unet(), some_pairs(states=20, positives=3), FCPAConfig(reduction=reduction, draws=2)
     draws = fcpa.draw(np.random.default_rng(3), 20, 2, 100, (H, A))
-    objective = fcpa._Objective(net, NOISING, pairs, config, never)
+    objective = fcpa._Objective(runner(net), NOISING, pairs, config, never)
     loss, winner, loser = objective.report(draws)
 
     plus = reference_errors(net, pairs.positives, pairs.features, draws, pairs.owner, reduction)
@@ -102,7 +108,7 @@ def test_a_chunk_paired_with_itself_teaches_nothing():
         features=pairs.features, negatives=pairs.negatives, positives=pairs.negatives, owner=torch.arange(3),
         weights=torch.ones(3),
     )  # fmt: skip
-    objective = fcpa._Objective(unet(), NOISING, same, FCPAConfig(), never)
+    objective = fcpa._Objective(runner(unet()), NOISING, same, FCPAConfig(), never)
     g_winner, g_loser = objective.gradients(fcpa.draw(np.random.default_rng(0), 3, 2, 100, (H, A)))
     assert g_winner.norm() > 0
     assert torch.allclose(g_winner, -g_loser, atol=1e-6)
@@ -145,7 +151,7 @@ def test_a_seed_repeats_the_update():
 ])  # fmt: skip
 def test_ablations_leave_one_side_out(objective, uses_winner, uses_loser):
     draws = fcpa.draw(np.random.default_rng(0), 3, 2, 100, (H, A))
-    objective_ = fcpa._Objective(unet(), NOISING, some_pairs(), FCPAConfig(objective=objective), never)
+    objective_ = fcpa._Objective(runner(unet()), NOISING, some_pairs(), FCPAConfig(objective=objective), never)
     g_winner, g_loser = objective_.gradients(draws)
     assert (g_winner.norm() > 0) == uses_winner
     assert (g_loser.norm() > 0) == uses_loser
@@ -158,7 +164,7 @@ def test_awr_weights_the_error_of_each_chunk():
         weights=torch.tensor([2.0, 0.0, 1.0]),
     )  # fmt: skip
     draws = fcpa.draw(np.random.default_rng(0), 3, 2, 100, (H, A))
-    loss, _, loser = fcpa._Objective(net, NOISING, weighted, FCPAConfig(objective="awr"), never).report(draws)
+    loss, _, loser = fcpa._Objective(runner(net), NOISING, weighted, FCPAConfig(objective="awr"), never).report(draws)
     errors = reference_errors(net, pairs.positives, pairs.features, draws, torch.arange(3), "sum")
     assert loss == pytest.approx(((2 * errors[0] + errors[2]) / 3).item(), rel=1e-5)
     assert math.isnan(loser)
@@ -257,9 +263,26 @@ def test_a_step_size_that_explodes_fails_and_leaves_the_weights_as_they_were():
 
 
 def test_cancellation_ends_it_between_two_passes():
-    passes = []
-    net = unet()
-    net.register_forward_hook(lambda *_: passes.append(1))
+    looks = []
+
+    def cancelled() -> bool:
+        looks.append(1)
+        return len(looks) >= 7
+
     with pytest.raises(AdaptationCancelledError):
-        run(FCPAConfig(steps=50), some_pairs(states=30, positives=8), net, cancelled=lambda: len(passes) >= 7)
-    assert len(passes) == 7
+        run(FCPAConfig(steps=50), some_pairs(states=30, positives=8), cancelled=cancelled)
+    assert len(looks) == 7
+
+
+def test_it_looks_for_cancellation_before_every_batch_of_at_most_64(monkeypatch):
+    looks, rows = [], []
+    run_ = FastUnet.run
+
+    def counting(self, noisy, k, condition):
+        rows.append(len(noisy))
+        return run_(self, noisy, k, condition)
+
+    monkeypatch.setattr(FastUnet, "run", counting)
+    run(FCPAConfig(steps=2), some_pairs(states=20, positives=8), cancelled=lambda: bool(looks.append(1)))
+    assert max(rows) <= 64
+    assert len(looks) > len(rows)
