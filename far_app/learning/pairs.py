@@ -59,13 +59,15 @@ def candidates(
 ) -> Float[Tensor, "S M H A"]:
     """M chunks from the policy for every state, in batches of BATCH across states."""
     states, per_state = noise.shape[:2]
+    if not states:
+        return torch.zeros_like(noise)
     flat = noise.flatten(0, 1)
     state = torch.arange(states).repeat_interleave(per_state)
     chunks = []
     for rows in torch.arange(len(flat)).split(BATCH):
         check(cancelled)
         chunks.append(sample(features[state[rows]], flat[rows]))
-    return torch.cat(chunks).reshape(noise.shape) if chunks else torch.zeros_like(noise)
+    return torch.cat(chunks).reshape(noise.shape)
 
 
 def distance(
