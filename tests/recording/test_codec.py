@@ -34,7 +34,7 @@ def test_a_float_survives_exactly_with_nan_and_infinities(value: float) -> None:
     assert back == value or (math.isnan(back) and math.isnan(value))
 
 
-@given(st.integers(0, 20).flatmap(lambda n: arrays(n)))
+@given(st.integers(0, 20).flatmap(arrays))
 def test_a_vector_survives_exactly(array: np.ndarray) -> None:
     back = through_json(np.ndarray, array)
     assert back.shape == array.shape
@@ -55,7 +55,7 @@ def test_a_chunk_survives_exactly(actions: Any, candidates: Any, value: float, v
 
 @settings(max_examples=30)
 @given(
-    numbers=st.integers(8, 40).flatmap(lambda n: arrays(n)),
+    numbers=st.integers(8, 40).flatmap(arrays),
     flagged=st.lists(st.integers(0, 1000)),
     threshold=floats,
     losses=st.lists(floats, max_size=4),
