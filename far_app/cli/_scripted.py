@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from far_app.errors import ConfigError
-from far_app.protocols import History, PolicySpec
+from far_app.protocols import History, Policy, PolicySpec
 from far_app.session.adaptation import unchanged
 from far_app.types import ACTION_DIM, ActionChunk, Adaptation, AdaptationStep, Attempt
 
@@ -57,7 +57,7 @@ class ScriptedMethod:
     name = "test"
 
     def __init__(self, kind: str) -> None:
-        self.policy = ScriptedPolicy(kind)
+        self.policy: Policy = ScriptedPolicy(kind)
 
     def begin(self, scene_seed: int) -> None: ...
 

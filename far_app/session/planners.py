@@ -55,8 +55,10 @@ class LockstepPlanner:
 class ThreadedPlanner:
     """A worker thread that always plans from the newest history; what it could not keep up with is dropped.
 
-    Chunks older than the last `begin` or `prime` are forgotten. A failure of the policy ends planning until the next
-    `begin` and is kept in `failure` for the driver.
+    It begins on a history when the driver says `go`, once the tick's target is on its way: inference must not fight
+    for the interpreter with the few lines between a deadline and its target. Chunks older than the last `begin` or
+    `prime` are forgotten. A failure of the policy ends planning until the next `begin` or `prime` and is kept in
+    `failure` for the driver.
     """
 
     def __init__(self) -> None:
@@ -66,6 +68,7 @@ class ThreadedPlanner:
         self._changed = threading.Condition()
         self._policy: Policy | None = None
         self._request: tuple[int, PlanRequest] | None = None
+        self._waiting: tuple[int, PlanRequest] | None = None
         self._ready: list[ActionChunk] = []
         self._handed_out: list[ActionChunk] = []
         self._primed_tick = -1
@@ -98,11 +101,17 @@ class ThreadedPlanner:
             assert self._policy is not None, "begin comes first"
             if tick != self._primed_tick and self.failure is None:
                 request = PlanRequest(history=history, tick=tick, noise_key=noise_key, policy=self._policy)
-                self._request = (self._epoch, request)
-                self._changed.notify_all()
+                self._waiting = (self._epoch, request)
             ready, self._ready = self._ready, []
         self._handed_out += ready
         return ready
+
+    def go(self) -> None:
+        """Plan from the history that the last `plan` handed over."""
+        with self._changed:
+            if self._waiting is not None:
+                self._request, self._waiting = self._waiting, None
+                self._changed.notify_all()
 
     def handed_out(self) -> list[ActionChunk]:
         """The chunks that the trial took since the last call (for the page and the recording); the loop's thread."""
@@ -116,7 +125,8 @@ class ThreadedPlanner:
         self._thread.join(timeout=5.0)
 
     def _forget(self, policy: Policy) -> None:
-        self._policy, self._request, self._ready, self.failure = policy, None, [], None
+        self._policy, self._ready, self.failure = policy, [], None
+        self._request = self._waiting = None
         self._primed_tick = -1
         self._epoch += 1
 

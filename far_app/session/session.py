@@ -90,6 +90,8 @@ class Session:
             clock=self.clock, publisher=publisher, freshness=settings.freshness, headless=settings.headless,
         )  # fmt: skip
         self.results: list[TrialResult] = []
+        self.last_attempt: Attempt | None = None
+        """The newest attempt that has ended."""
         self._adaptation: BackgroundAdaptation | None = None
         self._attempts: list[Attempt] = []
         self._adaptations: list[Adaptation] = []
@@ -166,6 +168,7 @@ class Session:
 
     def _pass_tick(self, tick: Tick) -> float:
         """Bookkeeping of the last tick, then wait for this one's deadline and attend to what happened."""
+        self.planner.go()
         if tick.step is not None and tick.step.tick == self._recorded:
             self._record(tick.step)
         self._report()
@@ -198,6 +201,7 @@ class Session:
         self.recorder.end_attempt(attempt)
         self._in_attempt = False
         self._attempts.append(attempt)
+        self.last_attempt = attempt
         word = "success" if attempt.outcome.success else "failure"
         supervision.say(f"attempt {attempt.index}: {word} by {attempt.outcome.judged_by}, {len(attempt.steps)} ticks")
         supervision.rest()

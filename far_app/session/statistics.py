@@ -88,5 +88,5 @@ def percentiles(values: array.array[float] | list[float], scale: float = 1.0) ->
     if not len(values):
         return dict.fromkeys(("p50", "p99", "p999", "max"))
     array_ = np.asarray(values, dtype=float) * scale
-    p50, p99, p999 = np.percentile(array_, (50, 99, 99.9))
-    return {"p50": round(p50, 3), "p99": round(p99, 3), "p999": round(p999, 3), "max": round(float(array_.max()), 3)}
+    p50, p99, p999, largest = np.percentile(array_, (50, 99, 99.9, 100)).round(3).tolist()
+    return {"p50": p50, "p99": p99, "p999": p999, "max": largest}

@@ -1,0 +1,1 @@
+"""Measurements: the loop's lateness, inference, adaptation. Their JSON fields stay stable."""

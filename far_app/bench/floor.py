@@ -1,0 +1,37 @@
+"""The floor: how late a bare 30 Hz sleeper wakes on this machine, under the same load and priority as the loop.
+
+`python -m far_app.bench.floor` sleeps until SIGTERM (or its parent's death) and prints [[deadline, late], …] as JSON.
+Imports nothing heavier than the standard library, so that nothing but the machine is measured.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import threading
+import time
+
+
+def main() -> None:
+    rate, niceness = float(sys.argv[1]), int(sys.argv[2])
+    ended: list[int] = []
+    signal.signal(signal.SIGTERM, lambda *_: ended.append(1))
+    parent = os.getppid()
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
+    period = 1.0 / rate
+    due = time.monotonic() + period
+    woken: list[tuple[float, float]] = []
+    while not ended and os.getppid() == parent:
+        time.sleep(max(0.0, due - time.monotonic()))
+        now = time.monotonic()
+        woken.append((due, now - due))
+        due = due + period if now < due + period else now + period
+    json.dump(woken, sys.stdout)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,189 @@
+"""`far bench loop`: does learning disturb control? The whole application for a while, half of it with FCPA running.
+
+The twin at 30 Hz with recording, the page's process and one connected client (a raw WebSocket: a browser on the same
+cores would measure the browser). Lateness is that of a target's acceptance in the hw server; `floor` is a bare sleeper
+in a process of its own, all along.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from far_app.bench.report import write
+from far_app.cli.options import RunOptions
+from far_app.cli.stage import Stage, stage
+from far_app.errors import ConfigError, FarError
+from far_app.protocols import Method
+from far_app.session.adaptation import BackgroundAdaptation
+from far_app.session.inbox import IntentInbox
+from far_app.session.realtime import LOOP_NICENESS
+from far_app.session.statistics import LoopStatistics, percentiles
+from far_app.session_states import Intent
+from far_app.types import Attempt
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopOptions:
+    """Lateness of the 30 Hz loop with everything running, idle and adapting."""
+
+    seconds: float = 60.0
+    """How long to measure, both halves together."""
+    json: Path | None = None
+    """Write the report here."""
+    policy: str | None = None
+    """Policy checkpoint; the shipped quickstart model by default."""
+    critic: Path | None = None
+    """Critic checkpoint; the one beside the policy by default."""
+    seed: int = 0
+    port: int = 0
+    """The page's port; 0 takes a free one."""
+    torch_threads: int = 1
+    page: bool = True
+    """Run the page and its client too."""
+
+    def __post_init__(self) -> None:
+        if self.seconds < 10:
+            raise ConfigError(f"--seconds is {self.seconds:g}, must be at least 10 (an attempt each half)")
+
+
+def main(arguments: Sequence[str]) -> int:
+    options = tyro.cli(LoopOptions, args=list(arguments), prog="far bench loop")
+    report = measure(options)
+    write(report, options.json)
+    return 0
+
+
+def measure(options: LoopOptions) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory(prefix="far-bench-") as recordings:
+        run = RunOptions(
+            seed=options.seed, policy=options.policy, critic=options.critic, port=options.port, method="far",
+            headless=not options.page, torch_threads=options.torch_threads, recordings=Path(recordings),
+        )  # fmt: skip
+        with stage(run) as stage_, client(stage_.page_url, options.seconds) as connected:
+            half = options.seconds / 2
+            with floor(stage_.task.rate) as woken:
+                idle, attempt, idle_span = session(stage_, half)
+                with learning_all_along(stage_.parts.method, attempt) as rounds:
+                    adapting, _, adapting_span = session(stage_, half)
+    return {
+        "seconds": options.seconds,
+        "page_client": connected,
+        "idle": _phase(idle) | {"floor": _floor(woken, idle_span)},
+        "adapting": _phase(adapting) | {"floor": _floor(woken, adapting_span), "adaptations": len(rounds)},
+        "floor": _floor(woken, (0.0, float("inf"))),
+    }
+
+
+def session(stage_: Stage, seconds: float) -> tuple[LoopStatistics, Attempt, tuple[float, float]]:
+    """Trials under naive retry for so long; returns the last whole attempt too, and when it was."""
+    statistics, inbox = LoopStatistics(), IntentInbox()
+    began = time.monotonic()
+    timer = threading.Timer(seconds, inbox.put, (Intent.QUIT,))
+    timer.daemon = True
+    with stage_.session(stage_.writer(), inbox, statistics, method=_Unlearning(stage_.parts.method)) as session_:
+        timer.start()
+        session_.run()
+    if session_.recorder.error is not None:
+        raise session_.recorder.error
+    if session_.last_attempt is None:
+        raise FarError(f"no attempt was completed within {seconds:g} s; measure for longer")
+    return statistics, session_.last_attempt, (began, time.monotonic())
+
+
+class _Unlearning:
+    """The base policy of a method, tried again unchanged: what runs in both halves."""
+
+    def __init__(self, method: Method) -> None:
+        method.begin(0)
+        self.name, self.policy = "nr", method.policy
+        self.perturb = method.perturb
+
+    def begin(self, scene_seed: int) -> None: ...
+
+    def adapt(self, attempt: Attempt, cancelled: Any, progress: Any) -> Any:
+        from far_app.session.adaptation import unchanged
+
+        return unchanged(self.policy.version, "none")
+
+
+@contextlib.contextmanager
+def learning_all_along(method: Method, attempt: Attempt) -> Iterator[list[float]]:
+    """One adaptation after the other on the same failed attempt, as a session runs them; yields their durations."""
+    ended, rounds = threading.Event(), list[float]()
+
+    def learn() -> None:
+        while not ended.is_set():
+            began = time.monotonic()
+            method.begin(attempt.scene_seed)
+            adaptation = BackgroundAdaptation(method, attempt, limit=600.0)
+            while adaptation.running and not ended.wait(0.05):
+                pass
+            if adaptation.running:
+                adaptation.cancel(wait=True)
+            else:
+                rounds.append(time.monotonic() - began)
+
+    thread = threading.Thread(target=learn, name="bench-learning", daemon=True)
+    thread.start()
+    try:
+        yield rounds
+    finally:
+        ended.set()
+        thread.join()
+
+
+@contextlib.contextmanager
+def floor(rate: float) -> Iterator[list[tuple[float, float]]]:
+    """The sleeper, alongside; its wake-ups are there at the end."""
+    woken: list[tuple[float, float]] = []
+    command = [sys.executable, "-m", "far_app.bench.floor", str(rate), str(LOOP_NICENESS)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        yield woken
+    finally:
+        process.terminate()
+        output, _ = process.communicate(timeout=10)
+        woken += [(due, late) for due, late in json.loads(output or "[]")]
+
+
+@contextlib.contextmanager
+def client(page_url: str, seconds: float) -> Iterator[bool]:
+    """One client on the page, reading all it is sent."""
+    if not page_url:
+        yield False
+        return
+    command = [sys.executable, "-m", "ui.raw_client", page_url, "--seconds", str(seconds + 60)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield True
+        if process.poll() is not None:
+            raise FarError("the page's client lost its connection during the measurement; measure again")
+    finally:
+        process.terminate()
+        process.wait(10)
+
+
+def _phase(statistics: LoopStatistics) -> dict[str, Any]:
+    ages = {"plan_age_ticks": (statistics.plan_age, 1.0), "obs_age_ms": (statistics.observation_age, 1e3)}
+    wanted = ("p50", "p99")
+    return statistics.summary() | {
+        name: {k: v for k, v in percentiles(values, scale).items() if k in wanted}
+        for name, (values, scale) in ages.items()
+    }
+
+
+def _floor(woken: list[tuple[float, float]], span: tuple[float, float]) -> dict[str, Any]:
+    late = [late for due, late in woken if span[0] <= due <= span[1]]
+    return {"ticks": len(late), "late_ms": percentiles(late, 1e3)}

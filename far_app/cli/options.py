@@ -1,0 +1,59 @@
+"""What `far run` can be told; the benchmarks are told a part of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from far_app.config import RetryConfig
+from far_app.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Supervised trials: the policy tries, the app judges, learns from failure and retries; you watch."""
+
+    trials: int = 0
+    """Trials to run; 0 goes on until you quit."""
+    seed: int = 0
+    """Scene seed of the first trial; the next trial has the next."""
+    headless: bool = False
+    """No page; a fault ends the run with an error."""
+    summary_json: Path | None = None
+    """Write the summary here at the end."""
+    method: str = "far"
+    """How to retry: dp, nr, perturb, fcpa, far."""
+    task: str = "lift"
+    rig: str = "twin"
+    """Name below hw/rigs, or the path of a rig's TOML file."""
+    policy: str | None = None
+    """Policy checkpoint; the shipped quickstart model by default."""
+    critic: Path | None = None
+    """Critic checkpoint; the one beside the policy by default."""
+    device: str = "cpu"
+    """cpu or cuda."""
+    max_attempts: int | None = None
+    """Attempts a trial; the task's by default."""
+    port: int = 8080
+    """The page's port; 0 takes a free one."""
+    host: str = "127.0.0.1"
+    """Address the page binds to."""
+    rerun: bool = True
+    """Show the session live in a rerun viewer too."""
+    scene3d: bool = True
+    """Show the arm in 3D on the page."""
+    recordings: Path = Path("recordings")
+    """Folder of the sessions."""
+    torch_threads: int = 1
+    """Threads of one torch operation in the loop's process."""
+    retry: RetryConfig = field(default_factory=RetryConfig)
+    """Settings of the method."""
+    verbose: bool = False
+    """Log every phase change to the terminal."""
+
+    def __post_init__(self) -> None:
+        limits = {"trials": 0, "seed": 0, "torch_threads": 1, "max_attempts": 1}
+        for name, least in limits.items():
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ConfigError(f"--{name.replace('_', '-')} is {value}, must be at least {least}")

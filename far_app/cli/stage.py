@@ -1,0 +1,195 @@
+"""Everything a session needs, started together and ended together: hw server, page, policy, link. Used by `far run` and
+`far bench loop`.
+
+The hw server and the page start first; torch and the checkpoints load in this process meanwhile.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import http.client
+import os
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from far_app.cli.assemble import Parts, assemble, check_observation
+from far_app.cli.options import RunOptions
+from far_app.cli.ports import choose_port
+from far_app.cli.processes import Child, Family, run_folder
+from far_app.config import TaskConfig
+from far_app.detectors import TwinCheck
+from far_app.endpoints import Endpoints
+from far_app.errors import FarError, RobotError
+from far_app.link import RemoteRobot
+from far_app.protocols import Method, PlanRequest, Policy
+from far_app.recording.schema import SessionInfo
+from far_app.recording.writer import SessionWriter
+from far_app.session.inbox import IntentInbox
+from far_app.session.planners import ThreadedPlanner, plan_one
+from far_app.session.publisher import TelemetryPublisher
+from far_app.session.realtime import prepare_process
+from far_app.session.recorder import Recorder
+from far_app.session.session import Session, SessionSettings
+from far_app.session.statistics import LoopStatistics
+from far_app.tasks import task as find_task
+from hw.rig import RigConfig, load_rig
+
+HARDWARE_PATIENCE = 180.0
+"""Seconds for the hw server's first observation (a first start compiles for a while)."""
+PAGE_PATIENCE = 60.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    options: RunOptions
+    task: TaskConfig
+    rig: RigConfig
+    parts: Parts
+    robot: RemoteRobot
+    folder: Path
+    family: Family
+    page: Child | None
+    page_url: str
+
+    def writer(self) -> SessionWriter:
+        """A new recording of what this stage is made of. Raises RecordingError."""
+        options = self.options
+        return SessionWriter(
+            options.recordings,
+            SessionInfo(
+                task=self.task.name, method=options.method, rig=dataclasses.asdict(self.rig),
+                policy=self.parts.policy_name, seed=options.seed, cameras=self.parts.method.policy.spec.cameras,
+                rate=self.task.rate,
+                config={"run": dataclasses.asdict(options), "task": dataclasses.asdict(self.task)},
+            ),
+        )  # fmt: skip
+
+    @contextlib.contextmanager
+    def session(
+        self, writer: SessionWriter, inbox: IntentInbox, statistics: LoopStatistics, method: Method | None = None
+    ) -> Iterator[Session]:
+        """A session on this stage, with the page told about it and revived when it dies."""
+        options = self.options
+        publisher = None
+        if self.page is not None:
+            publisher = TelemetryPublisher(Endpoints.in_folder(self.folder).telemetry, statistics.health)
+        try:
+            with revived(self.family, self.page):
+                yield Session(
+                    settings=SessionSettings(
+                        name=writer.folder.name, trials=options.trials, seed=options.seed, headless=options.headless,
+                        adaptation_limit=options.retry.adaptation_limit,
+                    ),
+                    robot=self.robot, planner=ThreadedPlanner(), method=method or self.parts.method,
+                    detector=TwinCheck(self.task.success_ticks), task=self.task, scale=self.rig.scale,
+                    recorder=Recorder(writer), inbox=inbox, statistics=statistics, publisher=publisher,
+                )  # fmt: skip
+        finally:
+            if publisher is not None:
+                publisher.close()
+
+
+@contextlib.contextmanager
+def stage(options: RunOptions) -> Iterator[Stage]:
+    """Start everything, wait until it is ready, end everything. Raises the FarError of whatever cannot start."""
+    task, rig = find_task(options.task), load_rig(options.rig)
+    port = 0 if options.headless else choose_port(options.host, options.port)
+    with run_folder() as folder, contextlib.ExitStack() as stack:
+        family = Family()
+        stack.callback(family.end)
+        hardware = family.add(start_hardware(folder, options.rig, options.task))
+        page = None if options.headless else family.add(start_page(folder, options, port))
+        parts = assemble(options.method, task, options.policy, options.critic, options.device, options.retry)
+        task = dataclasses.replace(task, max_attempts=options.max_attempts or parts.max_attempts or task.max_attempts)
+        robot = stack.enter_context(connected(folder, hardware))
+        if page is not None:
+            wait_for_page(page, options.host, port)
+        check_observation(parts.method.policy.spec, robot.observe())
+        prepare_process(options.torch_threads)
+        warm_up(parts.method.policy, robot)
+        yield Stage(
+            options=options, task=task, rig=rig, parts=parts, robot=robot, folder=folder, family=family, page=page,
+            page_url=f"http://{options.host}:{port}" if page is not None else "",
+        )  # fmt: skip
+
+
+def start_hardware(folder: Path, rig: str, task: str) -> Child:
+    arguments = ["--folder", str(folder), "--rig", rig, "--task", task, "--parent", str(os.getpid())]
+    return Child("hardware", "hw.server", arguments, folder)
+
+
+def start_page(folder: Path, options: RunOptions, port: int) -> Child:
+    arguments = ["--run-folder", str(folder), "--host", options.host, "--port", str(port)]
+    if not options.scene3d:
+        arguments.append("--no-scene3d")
+    return Child("page", "ui.server", arguments, folder)
+
+
+@contextlib.contextmanager
+def connected(folder: Path, hardware: Child) -> Iterator[RemoteRobot]:
+    """The robot behind the hw server, once it shows its first observation."""
+    deadline = time.monotonic() + HARDWARE_PATIENCE
+    robot = None
+    while robot is None:
+        hardware.check()
+        try:
+            robot = RemoteRobot(Endpoints.in_folder(folder), connect_timeout=1.0)
+        except RobotError as error:
+            if time.monotonic() > deadline:
+                raise RobotError(
+                    f"the hw server showed nothing within {HARDWARE_PATIENCE:.0f} s of its start: {error}"
+                ) from error
+    try:
+        yield robot
+    finally:
+        robot.close()
+
+
+def wait_for_page(page: Child, host: str, port: int) -> None:
+    """Returns once the page is served."""
+    deadline = time.monotonic() + PAGE_PATIENCE
+    while not _serves(host, port):
+        page.check()
+        if time.monotonic() > deadline:
+            raise FarError(f"the page did not answer at {host}:{port} within {PAGE_PATIENCE:.0f} s")
+        time.sleep(0.05)
+
+
+def warm_up(policy: Policy, robot: RemoteRobot) -> None:
+    """A few chunks before the clock matters: the first ones of a network take many times the later ones."""
+    history = (robot.observe(),) * policy.spec.n_obs
+    for i in range(3):
+        plan_one(PlanRequest(history=history, tick=i, noise_key=(0, 0, i), policy=policy))
+
+
+@contextlib.contextmanager
+def revived(family: Family, page: Child | None) -> Iterator[None]:
+    """While inside, a page that dies is started again, from a thread of its own."""
+    ended = threading.Event()
+
+    def watch() -> None:
+        while page is not None and not ended.wait(0.5):
+            family.revive(page)
+
+    thread = threading.Thread(target=watch, name="page-watch", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _serves(host: str, port: int) -> bool:
+    connection = http.client.HTTPConnection(host, port, timeout=1.0)
+    try:
+        connection.request("GET", "/")
+        return connection.getresponse().status < 500
+    except (OSError, http.client.HTTPException):
+        return False
+    finally:
+        connection.close()
