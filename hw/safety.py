@@ -122,14 +122,16 @@ def refusal(state: SafetyState, target: Target, now: float) -> str:
 def _admit(state: SafetyState, target: Target, limits: SafetyLimits) -> Verdict:
     wanted = np.clip(target.pose.position, -FAR_AWAY, FAR_AWAY)
     turned = target.pose.quaternion / np.linalg.norm(target.pose.quaternion)
-    position = near(state.goal.position, wanted, limits.step_translation)
-    position = near(state.pose.position, position, REACH * limits.step_translation)
+    ahead = math.dist(state.goal.position, state.pose.position)
+    position = near(state.pose.position, wanted, max(ahead, REACH * limits.step_translation))
+    position = near(state.goal.position, position, limits.step_translation)
     position = keep_goal_in_box(state.pose.position, position, limits)
     if position is state.pose.position:
         quaternion = state.pose.quaternion
     else:
-        quaternion = near_turn(state.goal.quaternion, turned, limits.step_rotation)
-        quaternion = near_turn(state.pose.quaternion, quaternion, REACH * limits.step_rotation)
+        ahead = float(np.linalg.norm(rotation_between(state.pose.quaternion, state.goal.quaternion)))
+        quaternion = near_turn(state.pose.quaternion, turned, max(ahead, REACH * limits.step_rotation))
+        quaternion = near_turn(state.goal.quaternion, quaternion, limits.step_rotation)
     goal = Pose(position=position, quaternion=quaternion)
     clipped = (
         float(np.abs(position - wanted).max()) > NOTICEABLE
@@ -155,10 +157,14 @@ def near_turn(anchor: Float[np.ndarray, "4"], wish: Float[np.ndarray, "4"], reac
     return wish if angle <= reach else quat_multiply(quat_from_rotvec(turn * (reach / angle)), anchor)
 
 
+def excess(position: Vector, limits: SafetyLimits) -> Vector:
+    """How far beyond the workspace box on each axis, metres, signed; zeros inside."""
+    return position - np.clip(position, limits.box_min, limits.box_max)
+
+
 def violation(position: Vector, limits: SafetyLimits) -> float:
     """Distance to the workspace box, metres; 0 inside."""
-    excess = np.maximum(np.subtract(limits.box_min, position), np.subtract(position, limits.box_max))
-    return math.hypot(*np.maximum(excess, 0.0))
+    return math.hypot(*excess(position, limits))
 
 
 def region(position: Vector, limits: SafetyLimits) -> tuple[Vector, Vector]:
@@ -227,7 +233,9 @@ def limit_length(vector: Vector, limit: float) -> Vector:
 
 def limit_change(wish: Vector, before: Vector, limit: float) -> Vector:
     """The wish, or the nearest vector no farther than `limit` from the one before."""
-    return before + limit_length(wish - before, limit)
+    change = wish - before
+    length = math.hypot(*change)
+    return wish if length <= limit else before + change * (limit / length)
 
 
 def _send(
@@ -236,9 +244,11 @@ def _send(
     """Keep the box, integrate one period."""
     here = state.pose.position
     kept = keep_in_box(here, state.velocity, velocity, limits, state.period)
-    if not kept.any() and violation(here, limits) > 0.0:
-        spin = limit_change(np.zeros(3), state.spin, limits.rotation_acceleration * state.period)
     position = np.clip(here + kept * state.period, *region(here, limits))  # against rounding only
+    outside = violation(here, limits)
+    if outside > 0.0 and violation(position, limits) >= outside:
+        position, kept = here, np.zeros(3)  # the last of the braking, less than rounding
+        spin = limit_change(np.zeros(3), state.spin, limits.rotation_acceleration * state.period)
     quaternion = state.pose.quaternion
     if spin.any():
         quaternion = quat_multiply(quat_from_rotvec(spin * state.period), quaternion)
@@ -261,15 +271,15 @@ def braking_point(position: Vector, velocity: Vector, acceleration: float, perio
 
 def keep_in_box(here: Vector, before: Vector, velocity: Vector, limits: SafetyLimits, period: float) -> Vector:
     """The velocity, or the most of it (mixed with full braking, which is always possible) that can still stop inside
-    the box; from outside it must lessen the violation, else the arm brakes."""
+    the box; from outside the violation must lessen all the way to the stop, else the arm brakes."""
     low, high = region(here, limits)
-    outside = violation(here, limits)
+    outside = violation(here, limits) > 0.0
 
     def allowed(candidate: Vector) -> bool:
         stop = braking_point(here, candidate, limits.acceleration, period)
-        if not bool(np.all((stop >= low) & (stop <= high))):
+        if not bool(((stop >= low) & (stop <= high)).all()):
             return False
-        return outside == 0.0 or not candidate.any() or violation(here + candidate * period, limits) < outside
+        return not outside or lessens(stop - here, stop, limits)
 
     if allowed(velocity):
         return velocity
@@ -280,3 +290,11 @@ def keep_in_box(here: Vector, before: Vector, velocity: Vector, limits: SafetyLi
             share += step
         step /= 2
     return braking + share * (velocity - braking)
+
+
+def lessens(way: Vector, end: Vector, limits: SafetyLimits) -> bool:
+    """A straight way out of a violation lessens it up to its end. The violation is convex along the way: it falls all
+    along when it still falls at the end, by a share of the motion that is more than rounding."""
+    beyond = excess(end, limits)
+    length = math.hypot(*beyond)
+    return length == 0.0 or not way.any() or float(way @ beyond) < -1e-3 * length * math.hypot(*way)
