@@ -39,8 +39,8 @@ _NEVER = 2**40
 
 class AttemptFile:
     def __init__(self, path: Path, header: AttemptHeader, cameras: tuple[str, ...]) -> None:
-        """Creates the file; the header and every known channel are on their way to the disk when this returns.
-        Raises OSError, FileExistsError too: nothing is ever overwritten."""
+        """Creates the file; the header and every known channel are with the kernel when this returns. Raises OSError,
+        FileExistsError too: nothing is ever overwritten."""
         self.path = path
         self.header = header
         self.steps = 0
@@ -63,7 +63,6 @@ class AttemptFile:
             self._camera_channel(camera)
         self._write("/attempt", AttemptHeader, header, time.monotonic())
         self.flush()
-        sync_folder(path.parent)
 
     def step(self, step: Step) -> None:
         self._write_json("/step", self._lower_step(step), step.deadline, step.tick)
@@ -92,15 +91,15 @@ class AttemptFile:
         self._writer.flush()
 
     def sync(self) -> None:
-        """Everything so far to the disk itself."""
+        """Everything so far to the disk itself; never while steps arrive, for it may take long."""
         self.flush()
         self._stream.sync()
+        sync_folder(self.path.parent)
 
     def close(self) -> None:
-        """Index and footer, to the disk; then the file never changes again."""
+        """Index and footer, to the kernel; then the file never changes again."""
         self._writer.finish()
         self._stream.flush()
-        self._stream.sync()
         self._stream.close()
 
     def let_go(self) -> None:

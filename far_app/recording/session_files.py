@@ -1,6 +1,7 @@
 """What the recorder does on the disk, one call after the other, in its own thread. Every call may raise OSError.
 
-Each takes first the monotonic time at which the session asked for it.
+Each takes first the monotonic time at which the session asked for it. While steps arrive nothing waits for the disk
+itself (that may take seconds on a busy one, and SIGKILL would then cost them); an attempt's end does, and a trial's.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from far_app.errors import RecordingError
-from far_app.recording.append_file import sync_folder
+from far_app.recording.append_file import sync_file, sync_folder
 from far_app.recording.attempt_file import AttemptFile
 from far_app.recording.schema import AttemptHeader, RecordedEvent, SessionInfo
 from far_app.recording.session_folder import (
@@ -44,17 +45,18 @@ class SessionFiles:
         self._on_attempt_closed = on_attempt_closed
         self._space_to_go_on = space_to_go_on
         self._file: AttemptFile | None = None
+        self._unsynced: list[Path] = []
+        """Closed files whose footers may not be on the disk yet."""
         self._next_space_check = 0.0
         self._late_told = False
         try:
             self._trials = TrialsLog(self.folder)
-            self._trials.append("session_started", stamp=time.monotonic())
+            self._trials.append("session_started", stamp=time.monotonic(), sync=True)
         except OSError as error:
             raise RecordingError(f"cannot record to {self.folder}: {error.strerror}; choose another folder") from error
 
     def begin_trial(self, stamp: float, trial: int, scene_seed: int) -> None:
         (self.folder / trial_folder(trial)).mkdir()
-        sync_folder(self.folder)
         self._trials.append("trial_started", stamp=stamp, trial=trial, detail={"scene_seed": scene_seed})
 
     def begin_attempt(self, stamp: float, header: AttemptHeader) -> None:
@@ -84,6 +86,7 @@ class SessionFiles:
             "attempt_ended", stamp=stamp, trial=file.header.trial, attempt=file.header.attempt,
             detail={"success": outcome.success, "judged_by": outcome.judged_by, "note": outcome.note,
                     "steps": file.steps},
+            sync=True,
         )  # fmt: skip
 
     def abandon_attempt(self, stamp: float, reason: str) -> None:
@@ -92,7 +95,7 @@ class SessionFiles:
         file.sync()
         self._trials.append(
             "attempt_abandoned", stamp=stamp, trial=file.header.trial, attempt=file.header.attempt, text=reason,
-            detail={"steps": file.steps},
+            detail={"steps": file.steps}, sync=True,
         )  # fmt: skip
 
     def adaptation_step(self, stamp: float, step: AdaptationStep) -> None:
@@ -101,7 +104,7 @@ class SessionFiles:
     def adaptation(self, stamp: float, adaptation: Adaptation) -> None:
         file = self._open
         file.adaptation(adaptation, stamp)
-        file.sync()
+        file.flush()
         self._trials.append(
             "adapted", stamp=stamp, trial=file.header.trial, attempt=file.header.attempt, text=adaptation.note,
             detail={"status": adaptation.status, "base_version": adaptation.base_version,
@@ -124,8 +127,9 @@ class SessionFiles:
 
     def end_trial(self, stamp: float, trial: int, success: bool, attempts: int) -> None:
         self.close_attempt()
+        self._sync()
         detail = {"success": success, "attempts": attempts}
-        self._trials.append("trial_ended", stamp=stamp, trial=trial, detail=detail)
+        self._trials.append("trial_ended", stamp=stamp, trial=trial, detail=detail, sync=True)
 
     def flush(self) -> None:
         """To the kernel; now and then a look at the room that is left."""
@@ -140,12 +144,14 @@ class SessionFiles:
         if self._file is not None:
             file, self._file = self._file, None
             file.close()
+            self._unsynced.append(file.path)
             if self._on_attempt_closed is not None:
                 self._on_attempt_closed(file.path)
 
     def end_session(self, stamp: float, reason: str) -> None:
         self.close_attempt()
-        self._trials.append("session_ended", stamp=stamp, text=reason)
+        self._sync()
+        self._trials.append("session_ended", stamp=stamp, text=reason, sync=True)
 
     def give_up(self, reason: str, intact: bool) -> None:
         """After an error: close what can be closed. `intact`: the attempt's file itself took no harm. Never raises."""
@@ -157,7 +163,7 @@ class SessionFiles:
                     file.close()
             file.let_go()
         with contextlib.suppress(OSError):
-            self._trials.append("recording_failed", stamp=time.monotonic(), text=reason)
+            self._trials.append("recording_failed", stamp=time.monotonic(), text=reason, sync=True)
 
     def refuse_more(self, stamp: float, reason: str) -> None:
         """The session's end after values were refused: the log must not say that all is here."""
@@ -170,6 +176,14 @@ class SessionFiles:
     def _open(self) -> AttemptFile:
         assert self._file is not None, "no attempt's file is open"
         return self._file
+
+    def _sync(self) -> None:
+        """Closed files and the folders that name them to the disk itself."""
+        for path in self._unsynced:
+            sync_file(path)
+            sync_folder(path.parent)
+        self._unsynced.clear()
+        sync_folder(self.folder)
 
     def _check_space(self) -> None:
         free = free_bytes(self.folder)

@@ -100,7 +100,7 @@ def _new_folder(root: Path, name: str) -> Path:
 
 
 class TrialsLog:
-    """trials.jsonl: one line an event, on the disk before append returns."""
+    """trials.jsonl: one line an event, with the kernel when append returns."""
 
     def __init__(self, folder: Path) -> None:
         self._file = AppendFile(folder / TRIALS_FILE)
@@ -115,8 +115,10 @@ class TrialsLog:
         attempt: int = 0,
         text: str = "",
         detail: Mapping[str, Any] | None = None,
+        sync: bool = False,
     ) -> None:
-        """Raises OSError."""
+        """With sync it and every line before it are on the disk itself when this returns, which may take long on a
+        busy disk: never while steps arrive. Raises OSError."""
         entry = LogEntry(
             event=event, stamp=stamp, wall=wall_now(), trial=trial, attempt=attempt, text=text,
             detail=plain(detail or {}),
@@ -124,7 +126,8 @@ class TrialsLog:
         line = json.dumps(codec(LogEntry).encode(entry), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
         self._file.write(f"{line}\n".encode())
         self._file.flush()
-        self._file.sync()
+        if sync:
+            self._file.sync()
 
     def close(self) -> None:
         self._file.close()
