@@ -28,12 +28,14 @@ def through_json(hint: Any, value: Any) -> Any:
     return decode(hint, json.loads(json.dumps(codec(hint).encode(value), allow_nan=False)), "a value")
 
 
+@settings(deadline=None)
 @given(floats)
 def test_a_float_survives_exactly_with_nan_and_infinities(value: float) -> None:
     back = through_json(float, value)
     assert back == value or (math.isnan(back) and math.isnan(value))
 
 
+@settings(max_examples=50, deadline=None)
 @given(st.integers(0, 20).flatmap(arrays))
 def test_a_vector_survives_exactly(array: np.ndarray) -> None:
     back = through_json(np.ndarray, array)
@@ -41,7 +43,7 @@ def test_a_vector_survives_exactly(array: np.ndarray) -> None:
     np.testing.assert_array_equal(back, array)
 
 
-@settings(max_examples=30)
+@settings(max_examples=30, deadline=None)
 @given(
     actions=arrays(8, 7),
     candidates=st.none() | arrays(3, 8, 7, dtype=np.float32),
@@ -53,7 +55,7 @@ def test_a_chunk_survives_exactly(actions: Any, candidates: Any, value: float, v
     assert values.same(through_json(ActionChunk, chunk), chunk)
 
 
-@settings(max_examples=30)
+@settings(max_examples=30, deadline=None)
 @given(
     numbers=st.integers(8, 40).flatmap(arrays),
     flagged=st.lists(st.integers(0, 1000)),

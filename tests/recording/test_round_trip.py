@@ -118,7 +118,7 @@ def test_the_mcap_library_reads_the_file_by_its_index(tmp_path: Path) -> None:
     assert [step["observation"]["frames"]["front"] for step in found["/step"]] == [0, 1, 2, 3, 4]
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1))
 def test_frames_are_lossless(height: int, width: int, seed: int) -> None:
     image = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
