@@ -26,6 +26,7 @@ from far_app.learning.cancellation import AdaptationCancelledError, Cancelled, c
 from far_app.learning.critic import Critic
 from far_app.learning.pairs import Pairs, candidates, merged, select, weighted_trajectory
 from far_app.learning.policy import DiffusionPolicy
+from far_app.learning.preference import Demonstrations, Noising
 from far_app.learning.trainable import trainable
 from far_app.methods.evidence import features, recorded_values, sent_chunks, values
 from far_app.perturbation import Perturbation, perturbation
@@ -47,7 +48,7 @@ class Ingredients:
     critic: Critic | None
     act: Act
     config: RetryConfig = field(default_factory=RetryConfig)
-    demonstrations: fcpa.Demonstrations | None = None
+    demonstrations: Demonstrations | None = None
     """Only the bc guard needs them."""
 
 
@@ -166,7 +167,7 @@ class _Learning:
         accumulate = config.fcpa.accumulate
         denoiser = copy.deepcopy((method.acting if accumulate else method.base).denoiser).requires_grad_(True).eval()
         update = fcpa.adapt(
-            denoiser, fcpa.Noising(add_noise=diffusion.add_noise, steps=diffusion.TRAIN_STEPS),
+            denoiser, Noising(add_noise=diffusion.add_noise, steps=diffusion.TRAIN_STEPS),
             pairs if accumulate else merged([*method.rounds, pairs]), config.fcpa, self._rng("fcpa"), self.cancelled,
             lambda step: (self.history.append(step), progress(step))[1], method.demonstrations,
         )  # fmt: skip

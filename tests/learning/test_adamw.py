@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from far_app.errors import PolicyError
+from far_app.learning import adamw
 from far_app.learning.adamw import FlatAdamW, guarded_step
 
 
@@ -25,6 +26,19 @@ def test_flat_adamw_takes_the_steps_of_torchs():
         assert torch.allclose(a, b, atol=1e-6)
 
 
+def test_slope_foretells_the_step():
+    """Also across pieces."""
+    size = adamw.PIECE + 10
+    optimiser = FlatAdamW([torch.zeros(size)], lr=1e-2)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(3):
+        g_winner, g_loser = torch.randn(2, size, generator=generator)
+        foretold = optimiser.slope(g_winner, g_loser, 0.4)
+        before = optimiser.weights.clone()
+        optimiser.step(g_winner + 0.4 * g_loser)
+        assert foretold == pytest.approx(float(g_winner @ (optimiser.weights - before)), rel=1e-4)
+
+
 @given(st.integers(0, 100_000), st.floats(-1, 1), st.floats(0.1, 30))
 @settings(deadline=None, max_examples=60)
 def test_a_guarded_step_never_raises_the_winners_error_to_first_order(seed, alignment, loser_size):
@@ -35,9 +49,9 @@ def test_a_guarded_step_never_raises_the_winners_error_to_first_order(seed, alig
     for _ in range(4):
         g_winner = torch.randn(size, generator=generator)
         g_loser = loser_size * (-alignment * g_winner + (1 - abs(alignment)) * torch.randn(size, generator=generator))
-        before = optimiser.weights()
+        before = optimiser.weights.clone()
         guarded_step(optimiser, g_winner, g_loser)
-        assert float(g_winner @ (optimiser.weights() - before)) <= 1e-6
+        assert float(g_winner @ (optimiser.weights - before)) <= 1e-6
 
 
 def test_an_unopposed_loser_is_not_scaled():

@@ -15,11 +15,12 @@ from far_app.learning import diffusion, fcpa
 from far_app.learning.cancellation import AdaptationCancelledError, never
 from far_app.learning.fast_unet import FastUnet
 from far_app.learning.pairs import Pairs
+from far_app.learning.preference import Demonstrations, Noising, Objective, draw
 from far_app.learning.trainable import Trainable, trainable
 from far_app.learning.unet import ConditionalUnet1d
 
 H, A, F = 8, 7, 12
-NOISING = fcpa.Noising(add_noise=diffusion.add_noise, steps=diffusion.TRAIN_STEPS)
+NOISING = Noising(add_noise=diffusion.add_noise, steps=diffusion.TRAIN_STEPS)
 
 
 def unet(seed: int = 0) -> nn.Module:
@@ -58,7 +59,7 @@ def flat(net: nn.Module) -> torch.Tensor:
 @pytest.mark.parametrize("states,draws", [(1, 1), (3, 2), (15, 2), (4, 8)])
 def test_k_is_stratified_over_the_diffusion_steps(states, draws):
     """Each state has one k in each of `draws` equal ranges; over the states each range is spread evenly."""
-    k = fcpa.draw(np.random.default_rng(0), states, draws, 100, (H, A)).k.numpy()
+    k = draw(np.random.default_rng(0), states, draws, 100, (H, A)).k.numpy()
     assert ((k >= 0) & (k < 100)).all()
     ranges = np.arange(draws) * 100 / draws
     assert ((k >= np.floor(ranges)) & (k < np.ceil(ranges + 100 / draws))).all()
@@ -85,8 +86,8 @@ def reference_errors(net, chunks, features, draws, owner, reduction):
 def test_loss_and_gradient_are_the_printed_formula(reduction):
     """Mean over pairs of −log σ(β [l(a⁻) − l(a⁺)]), with the same (k, ε) for a state's negative and positives."""
     net, pairs, config = unet(), some_pairs(states=20, positives=3), FCPAConfig(reduction=reduction, draws=2)
-    draws = fcpa.draw(np.random.default_rng(3), 20, 2, 100, (H, A))
-    objective = fcpa._Objective(runner(net), NOISING, pairs, config, never)
+    draws = draw(np.random.default_rng(3), 20, 2, 100, (H, A))
+    objective = Objective(runner(net), NOISING, pairs, config, never)
     loss, winner, loser = objective.report(draws)
 
     plus = reference_errors(net, pairs.positives, pairs.features, draws, pairs.owner, reduction)
@@ -108,8 +109,8 @@ def test_a_chunk_paired_with_itself_teaches_nothing():
         features=pairs.features, negatives=pairs.negatives, positives=pairs.negatives, owner=torch.arange(3),
         weights=torch.ones(3),
     )  # fmt: skip
-    objective = fcpa._Objective(runner(unet()), NOISING, same, FCPAConfig(), never)
-    g_winner, g_loser = objective.gradients(fcpa.draw(np.random.default_rng(0), 3, 2, 100, (H, A)))
+    objective = Objective(runner(unet()), NOISING, same, FCPAConfig(), never)
+    g_winner, g_loser = objective.gradients(draw(np.random.default_rng(0), 3, 2, 100, (H, A)))
     assert g_winner.norm() > 0
     assert torch.allclose(g_winner, -g_loser, atol=1e-6)
 
@@ -150,8 +151,8 @@ def test_a_seed_repeats_the_update():
     ("pairwise", True, True), ("no_positive", False, True), ("no_negative", True, False), ("awr", True, False),
 ])  # fmt: skip
 def test_ablations_leave_one_side_out(objective, uses_winner, uses_loser):
-    draws = fcpa.draw(np.random.default_rng(0), 3, 2, 100, (H, A))
-    objective_ = fcpa._Objective(runner(unet()), NOISING, some_pairs(), FCPAConfig(objective=objective), never)
+    draws = draw(np.random.default_rng(0), 3, 2, 100, (H, A))
+    objective_ = Objective(runner(unet()), NOISING, some_pairs(), FCPAConfig(objective=objective), never)
     g_winner, g_loser = objective_.gradients(draws)
     assert (g_winner.norm() > 0) == uses_winner
     assert (g_loser.norm() > 0) == uses_loser
@@ -163,8 +164,8 @@ def test_awr_weights_the_error_of_each_chunk():
         features=pairs.features, negatives=pairs.positives, positives=pairs.positives, owner=torch.arange(3),
         weights=torch.tensor([2.0, 0.0, 1.0]),
     )  # fmt: skip
-    draws = fcpa.draw(np.random.default_rng(0), 3, 2, 100, (H, A))
-    loss, _, loser = fcpa._Objective(runner(net), NOISING, weighted, FCPAConfig(objective="awr"), never).report(draws)
+    draws = draw(np.random.default_rng(0), 3, 2, 100, (H, A))
+    loss, _, loser = Objective(runner(net), NOISING, weighted, FCPAConfig(objective="awr"), never).report(draws)
     errors = reference_errors(net, pairs.positives, pairs.features, draws, torch.arange(3), "sum")
     assert loss == pytest.approx(((2 * errors[0] + errors[2]) / 3).item(), rel=1e-5)
     assert math.isnan(loser)
@@ -226,7 +227,7 @@ def test_scale_keeps_the_winners_error_lower_than_the_printed_loss_does(fitted):
 
 
 def test_behaviour_cloning_pulls_towards_the_demonstrations(fitted):
-    demonstrations = fcpa.Demonstrations(
+    demonstrations = Demonstrations(
         features=opposing_pairs().features[opposing_pairs().owner], chunks=opposing_pairs().positives
     )
     config = FCPAConfig(lr=2e-3, draws=4, guard="bc", bc_weight=1.0)
