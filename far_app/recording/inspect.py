@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 
 from far_app.errors import RecordingError
@@ -142,13 +143,22 @@ def find_session(path: Path) -> Path:
     for folder in (path, *path.parents[:2]):
         if (folder / SESSION_FILE).exists():
             return folder
-    sessions = sorted((p.parent for p in path.glob(f"*/{SESSION_FILE}")), key=lambda p: p.name) if path.is_dir() else []
+    sessions = sorted((p.parent for p in path.glob(f"*/{SESSION_FILE}")), key=_started) if path.is_dir() else []
     if not sessions:
         raise RecordingError(
             f"{path} {'holds no session' if path.exists() else 'does not exist'}; give a session's folder, "
             "such as recordings/sample"
         )
     return sessions[-1]
+
+
+def _started(session: Path) -> float:
+    """Seconds since 1970; 0 when the session does not say."""
+    try:
+        header = json.loads((session / SESSION_FILE).read_text(encoding="utf-8"))
+        return datetime.fromisoformat(header["started"]).timestamp()
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0.0
 
 
 def inspect_command(path: Path, as_json: bool) -> tuple[str, int]:

@@ -97,3 +97,13 @@ def test_a_path_without_a_session_is_refused_with_what_to_do(tmp_path: Path) -> 
         find_session(tmp_path)
     with pytest.raises(RecordingError, match="does not exist"):
         find_session(tmp_path / "nowhere")
+
+
+def test_above_several_sessions_the_newest_is_found(tmp_path: Path) -> None:
+    old = sessions.small_session(tmp_path, steps=1).rename(tmp_path / "sample")
+    header = json.loads((old / "session.json").read_text(encoding="utf-8"))
+    header["started"] = "2020-01-01T00:00:00+00:00"
+    (old / "session.json").write_text(json.dumps(header), encoding="utf-8")
+    assert find_session(tmp_path) == old
+    new = sessions.small_session(tmp_path, steps=1)
+    assert find_session(tmp_path) == new
