@@ -61,7 +61,7 @@ def load_critic(path: Path, policy: DiffusionPolicy) -> Critic:
         critic.load_state_dict(weights)
     except RuntimeError as error:
         raise CheckpointError(f"{path} does not fit the shape it names ({critic.shape}): {error}") from error
-    return critic.eval().requires_grad_(False)
+    return critic.to(policy.normalizer.low.device).eval().requires_grad_(False)
 
 
 def read_card(path: Path) -> dict[str, object]:

@@ -65,11 +65,10 @@ def adapt(
     Progress is told before the first step (step 0) and after each. Raises AdaptationCancelledError on cancellation;
     the copy is then of no use."""
     check_config(config, demonstrations)
-    chunk = (pairs.negatives.shape[1], pairs.negatives.shape[2])
-    runner = trainable(denoiser, horizon=chunk[0])
+    runner = trainable(denoiser, horizon=pairs.negatives.shape[1])
     objective = Objective(runner, noising, pairs, config, cancelled)
     states = len(pairs.features)
-    fixed = draw(rng, states, FIXED_DRAWS, noising.steps, chunk)
+    fixed = draw(rng, states, FIXED_DRAWS, noising.steps, pairs.negatives)
     optimiser = FlatAdamW(runner.parameters, lr=config.lr)
     start = optimiser.weights.clone()
     history: list[AdaptationStep] = []
@@ -88,7 +87,7 @@ def adapt(
         limit = report(0).winner_error * (1 + config.guard_rise)
         for step in range(1, config.steps + 1):
             before = optimiser.weights.clone()
-            fresh = draw(rng, states, config.draws, noising.steps, chunk)
+            fresh = draw(rng, states, config.draws, noising.steps, pairs.negatives)
             if config.guard == "scale":
                 guarded_step(optimiser, *objective.gradients(fresh))
             else:

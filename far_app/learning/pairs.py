@@ -108,8 +108,8 @@ def select(
     ranked."""
     states, per_state = chunks.shape[:2]
     if config.choose == "random":
-        chosen = (torch.arange(per_state) < config.positives).expand(states, -1)
-        empty = torch.zeros(states, dtype=torch.bool)
+        chosen = (torch.arange(per_state, device=chunks.device) < config.positives).expand(states, -1)
+        empty = torch.zeros(states, dtype=torch.bool, device=chunks.device)
     else:
         allowed, empty = moderate(distance(chunks, negatives, config.arm_only), config)
         scores = score(features.repeat_interleave(per_state, dim=0), chunks.flatten(0, 1)).reshape(states, per_state)
@@ -118,7 +118,8 @@ def select(
     owner = (kept.cumsum(0) - 1).repeat_interleave(chosen.sum(dim=1))
     return Pairs(
         features=features[kept], negatives=negatives[kept], positives=chunks[chosen], owner=owner,
-        weights=torch.ones(len(owner)), empty_states=int(empty.sum()), dropped_states=int((~kept).sum()),
+        weights=torch.ones(len(owner), device=chunks.device), empty_states=int(empty.sum()),
+        dropped_states=int((~kept).sum()),
     )  # fmt: skip
 
 
@@ -129,7 +130,11 @@ def weighted_trajectory(
     (η = 1/3, weights clipped at 100; paper, Eq. awr, and its choices)."""
     weights = torch.exp(advantages * AWR_INVERSE_TEMPERATURE).clamp(max=AWR_WEIGHT_LIMIT)
     return Pairs(
-        features=features, negatives=chunks, positives=chunks, owner=torch.arange(len(chunks)), weights=weights
+        features=features,
+        negatives=chunks,
+        positives=chunks,
+        owner=torch.arange(len(chunks), device=chunks.device),
+        weights=weights,
     )
 
 

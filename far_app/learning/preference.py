@@ -57,13 +57,16 @@ class Draws:
     noise: Float[Tensor, "S D H A"]
 
 
-def draw(rng: np.random.Generator, states: int, draws: int, diffusion_steps: int, chunk: tuple[int, int]) -> Draws:
-    """Fresh draws; k stratified: a state's D draws fall one into each of D equal ranges, and within a range the states
-    are spread evenly too."""
+def draw(
+    rng: np.random.Generator, states: int, draws: int, diffusion_steps: int, like: Float[Tensor, "N H A"]
+) -> Draws:
+    """Fresh draws for chunks like these; k stratified: a state's D draws fall one into each of D equal ranges, within
+    which the states are spread evenly too."""
     spread = np.stack([rng.permutation(states) for _ in range(draws)], axis=1) + rng.random((states, draws))
     k = ((np.arange(draws) + spread / states) / draws * diffusion_steps).astype(np.int64)
-    noise = rng.standard_normal((states, draws, *chunk), dtype=np.float32)
-    return Draws(k=torch.from_numpy(k.clip(max=diffusion_steps - 1)), noise=torch.from_numpy(noise))
+    noise = rng.standard_normal((states, draws, *like.shape[1:]), dtype=np.float32)
+    k = k.clip(max=diffusion_steps - 1)
+    return Draws(k=torch.from_numpy(k).to(like.device), noise=torch.from_numpy(noise).to(like.device))
 
 
 def denoising_errors(
@@ -167,9 +170,9 @@ class Objective:
         count, objective = draws.k.shape[1], self.config.objective
         for states, rows in blocks(self.pairs):
             owner = self.pairs.owner[rows] - states.start
-            own = torch.arange(states.stop - states.start)
+            own = torch.arange(states.stop - states.start, device=owner.device)
             winners, losers = [], []
-            winner = loser = torch.zeros(len(owner))
+            winner = loser = torch.zeros(len(owner), device=owner.device)
             if objective != "no_positive":
                 winners = self.errors(self.pairs.positives[rows], owner, states, draws)
                 winner = per_chunk(winners, count)
@@ -180,7 +183,9 @@ class Objective:
             loss = preference_loss(*at, self.config, self.pairs.weights[rows]) / len(self.pairs)
             to_winner, to_loser = torch.autograd.grad(loss, at, materialize_grads=True)
             self.accumulate(at_winner, winners, to_winner, count)
-            self.accumulate(at_loser, losers, torch.zeros(len(own)).index_add_(0, owner, to_loser), count)
+            self.accumulate(
+                at_loser, losers, torch.zeros_like(own, dtype=torch.float32).index_add_(0, owner, to_loser), count
+            )
 
     def accumulate(self, totals: list[Tensor], errors: list[Tensor], share: Float[Tensor, "N"], draws: int) -> None:
         """Add the gradients of Σ share · l_diff, batch by batch."""
@@ -194,11 +199,11 @@ class Objective:
         """Gradient of the behaviour-cloning loss on a minibatch of demonstration chunks."""
         rows = torch.from_numpy(rng.integers(len(demonstrations.chunks), size=BC_BATCH))
         chunks = demonstrations.chunks[rows]
-        draws = draw(rng, BC_BATCH, 1, self.noising.steps, (chunks.shape[1], chunks.shape[2]))
+        draws = draw(rng, BC_BATCH, 1, self.noising.steps, chunks)
         errors = denoising_errors(
             self.denoiser, self.noising, chunks, demonstrations.features[rows], draws, torch.arange(BC_BATCH),
             self.config.reduction, self.cancelled,
         )  # fmt: skip
         totals = self.zeros()
-        self.accumulate(totals, errors, torch.full((BC_BATCH,), 1 / BC_BATCH), 1)
+        self.accumulate(totals, errors, chunks.new_full((BC_BATCH,), 1 / BC_BATCH), 1)
         return self.denoiser.pull_back(totals)

@@ -34,7 +34,7 @@ def features(
         check(cancelled)
         some = ticks[first : first + HISTORIES_A_PASS]
         parts.append(policy.encode([history(attempt, t, policy.config.n_obs) for t in some]))
-    return torch.cat(parts) if parts else torch.zeros(0, policy.feature_dim)
+    return torch.cat(parts) if parts else torch.zeros(0, policy.feature_dim, device=policy.normalizer.low.device)
 
 
 def recorded_values(attempt: Attempt) -> Float[np.ndarray, "T+1"]:
@@ -47,7 +47,7 @@ def values(policy: DiffusionPolicy, critic: Critic, attempt: Attempt, cancelled:
     found = recorded_values(attempt)
     missing = np.flatnonzero(~np.isfinite(found))
     with torch.no_grad():
-        found[missing] = critic.value(features(policy, attempt, missing.tolist(), cancelled)).numpy()
+        found[missing] = critic.value(features(policy, attempt, missing.tolist(), cancelled)).cpu().numpy()
     return found
 
 

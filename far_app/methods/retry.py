@@ -180,7 +180,7 @@ class _Learning:
         method, config = self.method, self.method.config.pairs
         spec = method.policy.spec
         seen = features(method.base, self.attempt, ticks, self.cancelled)
-        negatives = torch.from_numpy(sent_chunks(self.attempt, ticks, spec.horizon))
+        negatives = torch.from_numpy(sent_chunks(self.attempt, ticks, spec.horizon)).to(seen.device)
         shape = (config.candidates, spec.horizon, spec.action_dim)
         noise = [self._rng("candidates", t).standard_normal(shape, dtype=np.float32) for t in ticks]
         self.note("encoding")
@@ -196,7 +196,7 @@ class _Learning:
 
         with torch.no_grad():
             stacked = torch.from_numpy(np.stack(noise)) if noise else torch.zeros(0, *shape)
-            chunks = candidates(sample, runner.condition(seen), stacked, self.cancelled)
+            chunks = candidates(sample, runner.condition(seen), stacked.to(seen.device), self.cancelled)
             if not bool(torch.isfinite(chunks).all()):
                 raise FarError(f"the policy {method.policy.version} sampled a non-finite candidate; nothing was learnt")
             self.note("candidates")
@@ -207,7 +207,7 @@ class _Learning:
         horizon = self.method.policy.spec.horizon
         ticks = range(len(self.attempt.steps) - horizon + 1)
         seen = features(self.method.base, self.attempt, ticks, self.cancelled)
-        chunks = torch.from_numpy(sent_chunks(self.attempt, ticks, horizon))
+        chunks = torch.from_numpy(sent_chunks(self.attempt, ticks, horizon)).to(seen.device)
         with torch.no_grad():
             return weighted_trajectory(seen, chunks, critic.q(seen, chunks) - critic.value(seen))
 

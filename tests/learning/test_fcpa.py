@@ -20,6 +20,7 @@ from far_app.learning.trainable import Trainable, trainable
 from far_app.learning.unet import ConditionalUnet1d
 
 H, A, F = 8, 7, 12
+LIKE = torch.zeros(1, H, A)
 NOISING = Noising(add_noise=diffusion.add_noise, steps=diffusion.TRAIN_STEPS)
 
 
@@ -59,7 +60,7 @@ def flat(net: nn.Module) -> torch.Tensor:
 @pytest.mark.parametrize("states,draws", [(1, 1), (3, 2), (15, 2), (4, 8)])
 def test_k_is_stratified_over_the_diffusion_steps(states, draws):
     """Each state has one k in each of `draws` equal ranges; over the states each range is spread evenly."""
-    k = draw(np.random.default_rng(0), states, draws, 100, (H, A)).k.numpy()
+    k = draw(np.random.default_rng(0), states, draws, 100, LIKE).k.numpy()
     assert ((k >= 0) & (k < 100)).all()
     ranges = np.arange(draws) * 100 / draws
     assert ((k >= np.floor(ranges)) & (k < np.ceil(ranges + 100 / draws))).all()
@@ -86,7 +87,7 @@ def reference_errors(net, chunks, features, draws, owner, reduction):
 def test_loss_and_gradient_are_the_printed_formula(reduction):
     """Mean over pairs of −log σ(β [l(a⁻) − l(a⁺)]), with the same (k, ε) for a state's negative and positives."""
     net, pairs, config = unet(), some_pairs(states=20, positives=3), FCPAConfig(reduction=reduction, draws=2)
-    draws = draw(np.random.default_rng(3), 20, 2, 100, (H, A))
+    draws = draw(np.random.default_rng(3), 20, 2, 100, LIKE)
     objective = Objective(runner(net), NOISING, pairs, config, never)
     loss, winner, loser = objective.report(draws)
 
@@ -110,7 +111,7 @@ def test_a_chunk_paired_with_itself_teaches_nothing():
         weights=torch.ones(3),
     )  # fmt: skip
     objective = Objective(runner(unet()), NOISING, same, FCPAConfig(), never)
-    g_winner, g_loser = objective.gradients(draw(np.random.default_rng(0), 3, 2, 100, (H, A)))
+    g_winner, g_loser = objective.gradients(draw(np.random.default_rng(0), 3, 2, 100, LIKE))
     assert g_winner.norm() > 0
     assert torch.allclose(g_winner, -g_loser, atol=1e-6)
 
@@ -151,7 +152,7 @@ def test_a_seed_repeats_the_update():
     ("pairwise", True, True), ("no_positive", False, True), ("no_negative", True, False), ("awr", True, False),
 ])  # fmt: skip
 def test_ablations_leave_one_side_out(objective, uses_winner, uses_loser):
-    draws = draw(np.random.default_rng(0), 3, 2, 100, (H, A))
+    draws = draw(np.random.default_rng(0), 3, 2, 100, LIKE)
     objective_ = Objective(runner(unet()), NOISING, some_pairs(), FCPAConfig(objective=objective), never)
     g_winner, g_loser = objective_.gradients(draws)
     assert (g_winner.norm() > 0) == uses_winner
@@ -164,7 +165,7 @@ def test_awr_weights_the_error_of_each_chunk():
         features=pairs.features, negatives=pairs.positives, positives=pairs.positives, owner=torch.arange(3),
         weights=torch.tensor([2.0, 0.0, 1.0]),
     )  # fmt: skip
-    draws = draw(np.random.default_rng(0), 3, 2, 100, (H, A))
+    draws = draw(np.random.default_rng(0), 3, 2, 100, LIKE)
     loss, _, loser = Objective(runner(net), NOISING, weighted, FCPAConfig(objective="awr"), never).report(draws)
     errors = reference_errors(net, pairs.positives, pairs.features, draws, torch.arange(3), "sum")
     assert loss == pytest.approx(((2 * errors[0] + errors[2]) / 3).item(), rel=1e-5)
