@@ -106,8 +106,8 @@ class TwinPlant:
 
     def to_base(self, position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -> Pose:
         """A world pose (xyzw) in the arm's base frame."""
-        inverse = quat_inverse(self._base_quaternion)
-        rotated = quat_multiply(quat_multiply(inverse, np.append(position - self._base_position, 0.0)), self._base_quaternion)
+        inverse, offset = quat_inverse(self._base_quaternion), np.append(position - self._base_position, 0.0)
+        rotated = quat_multiply(quat_multiply(inverse, offset), self._base_quaternion)
         return Pose(position=rotated[:3], quaternion=quat_multiply(inverse, quaternion))
 
     def to_world(self, pose: Pose) -> Pose:

@@ -42,7 +42,11 @@ class CameraPlacement:
 CAMERAS = {
     "front": CameraPlacement(position=(0.62, 0.0, 1.42), target=(-0.03, 0.0, 0.93), up=(0, 0, 1), fovy=48.0),
     "wrist": CameraPlacement(
-        position=(0.12, 0.0, 0.0), target=(0.015, 0.0, 0.17), up=(1, 0, 0), fovy=80.0, body="gripper0_right_xarm_gripper_base_link"
+        position=(0.12, 0.0, 0.0),
+        target=(0.015, 0.0, 0.17),
+        up=(1, 0, 0),
+        fovy=80.0,
+        body="gripper0_right_xarm_gripper_base_link",
     ),
 }
 
@@ -142,9 +146,7 @@ class TwinView:
         return poses
 
     def geometry(self) -> SceneGeometry:
-        meshes = tuple(
-            mesh for geom in range(self._model.ngeom) if (mesh := self._geom_mesh(geom)) is not None
-        )
+        meshes = tuple(mesh for geom in range(self._model.ngeom) if (mesh := self._geom_mesh(geom)) is not None)
         names = tuple(self._model.body(i).name for i in range(self._model.nbody))
         return SceneGeometry(meshes=meshes, body_names=names)
 
@@ -169,18 +171,30 @@ class TwinView:
             vertices, faces = shape.vertices, shape.faces
         else:
             return None
-        if model.geom_bodyid[geom] == 0 and kind != mujoco.mjtGeom.mjGEOM_BOX:
+        if model.geom_bodyid[geom] == 0:
             return None
         rotation = np.empty(9)
         mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
         placed = np.asarray(vertices) @ rotation.reshape(3, 3).T + model.geom_pos[geom]
-        rgba = model.geom_rgba[geom]
-        if model.geom_matid[geom] >= 0:
-            rgba = model.mat_rgba[model.geom_matid[geom]]
+        red, green, blue, alpha = self._color(geom)
         return BodyMesh(
             body=int(model.geom_bodyid[geom]), vertices=placed.astype(np.float32), faces=np.asarray(faces, np.int32),
-            rgba=tuple(float(c) for c in rgba),
+            rgba=(red, green, blue, alpha),
         )  # fmt: skip
+
+    def _color(self, geom: int) -> tuple[float, ...]:
+        """A geom's colour, its texture averaged (the page draws no textures)."""
+        model = self._model
+        material = model.geom_matid[geom]
+        if material < 0:
+            return tuple(float(c) for c in model.geom_rgba[geom])
+        rgba = np.array(model.mat_rgba[material], dtype=float)
+        texture = model.mat_texid[material][mujoco.mjtTextureRole.mjTEXROLE_RGB]
+        if texture >= 0:
+            start, channels = model.tex_adr[texture], model.tex_nchannel[texture]
+            pixels = model.tex_data[start : start + channels * model.tex_width[texture] * model.tex_height[texture]]
+            rgba[:3] *= pixels.reshape(-1, channels)[:, :3].mean(axis=0) / 255
+        return tuple(float(c) for c in rgba)
 
     def close(self) -> None:
         for renderer in self._renderers.values():

@@ -1,11 +1,13 @@
-"""`far demo`: demonstrations by the scripted expert, in lockstep with the twin, appended to an HDF5 file."""
+"""`far demo`: demonstrations by the scripted expert, in lockstep with the twin, appended to an HDF5 file.
+
+With --policy it records a policy's own attempts instead, whatever their outcome: what a critic learns failure from.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import logging
-import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,10 +15,13 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+from far_app.cli.lockstep_twin import lockstep_twin
+from far_app.config import TaskConfig
 from far_app.demonstrations import SEED_OFFSET, demonstrate
-from far_app.learning.dataset import count_episodes, episode_of, write_episode
+from far_app.learning.dataset import count_episodes, episode_of, last_scene, write_episode
 from far_app.tasks import task as find_task
-from hw.rig import load_rig
+from far_app.types import Observation
+from hw.lockstep import LockstepRobot
 
 log = logging.getLogger(__name__)
 
@@ -32,38 +37,65 @@ class DemoOptions:
     """Demonstration scenes are numbered from here; they never coincide with reporting scenes."""
     out: Path | None = None
     """HDF5 file; datasets/TASK.hdf5 by default."""
+    policy: Path | None = None
+    """Record this policy's attempts instead of the expert's demonstrations."""
     rig: str = "twin"
 
 
 def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(DemoOptions, args=list(arguments), prog="far demo")
-    os.environ.setdefault("LP_NUM_THREADS", "1")
-    from hw.lockstep import LockstepRobot
-    from hw.twin import TwinPlant
-    from hw.twin_view import TwinView
-
-    task, rig = find_task(options.task), load_rig(options.rig)
+    task = find_task(options.task)
+    robot = lockstep_twin(options.rig, task)
     path = options.out or Path("datasets") / f"{task.name}.hdf5"
-    plant = TwinPlant(rig, task)
-    robot = LockstepRobot(plant, TwinView(plant.model_xml(), plant.base_pose()), rig, task)
     env_args = {
-        "env_name": task.environment,
-        "type": 1,
-        "env_kwargs": {"robots": "XArm7", "rig": dataclasses.asdict(rig)},
-    }
-    scene = SEED_OFFSET + options.seed + count_episodes(path)
+        "env_name": task.environment, "type": 1, "env_kwargs": {"robots": "XArm7", "rig": dataclasses.asdict(robot.rig)}
+    }  # fmt: skip
+    attempt = policy_attempt(options.policy, task, robot) if options.policy is not None else None
+    scene = SEED_OFFSET + options.seed + last_scene(path)
     failures = 0
     with tqdm(total=options.n, initial=count_episodes(path), unit="demo") as bar:
         while bar.n < options.n:
-            seen, done, success = demonstrate(robot, robot.advance, task, rig.scale, scene)
-            if success:
+            if attempt is not None:
+                seen, done, success = attempt(scene)
+            else:
+                seen, done, success = demonstrate(robot, robot.advance, task, robot.rig.scale, scene)
+            failures += not success
+            if success or attempt is not None:
                 objects = np.array(
                     [np.concatenate([[*p.position, *p.quaternion] for p in o.objects.values()]) for o in seen]
                 )
-                write_episode(path, episode_of(seen, done, True, scene), objects, env_args)
+                write_episode(path, episode_of(seen, done, success, scene), objects, env_args)
                 bar.update()
-            else:
-                failures += 1
             scene += 1
-    log.info("%s holds %d demonstrations; the expert failed %d times", path, options.n, failures)
+    log.info("%s holds %d episodes; %d attempts failed", path, options.n, failures)
     return 0
+
+
+Recorded = tuple[list[Observation], list[np.ndarray], bool]
+
+
+def policy_attempt(checkpoint: Path, task: TaskConfig, robot: LockstepRobot) -> Callable[[int], Recorded]:
+    """First attempts of a policy, by scene, in the form of `demonstrate`."""
+    import torch
+
+    from far_app.cli.assemble import assemble
+    from far_app.config import RetryConfig
+    from far_app.detectors import TwinCheck
+    from far_app.session.lockstep import adapt_at_once, run_lockstep
+    from far_app.session.planners import LockstepPlanner
+    from far_app.trial import trial
+
+    torch.set_num_threads(1)
+    once = dataclasses.replace(task, max_attempts=1)
+    method = assemble("dp", task, str(checkpoint), None, "cpu", RetryConfig()).method
+
+    def attempt(scene: int) -> Recorded:
+        events = trial(
+            scene, robot, LockstepPlanner(), method, TwinCheck(task.success_ticks), once, robot.rig.scale, adapt_at_once
+        )
+        (first,) = run_lockstep(events, robot.advance).attempts
+        actions = [s.sent if np.isfinite(s.sent).all() else s.commanded for s in first.steps]
+        seen = [*(s.observation for s in first.steps), first.final]
+        return seen, [*actions, actions[-1]], first.outcome.success
+
+    return attempt

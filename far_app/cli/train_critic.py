@@ -10,26 +10,29 @@ from pathlib import Path
 
 import tyro
 
+log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainCriticOptions:
     """Train V and Q for one policy; the same command goes on where it was interrupted."""
 
-    policy: Path
-    """Checkpoint of the policy whose encoder the critic sees through."""
-    demos: Path
-    """Demonstrations (robomimic HDF5)."""
+    task: str = "lift"
+    policy: Path | None = None
+    """Checkpoint of the policy whose encoder the critic sees through; runs/TASK-quickstart's by default."""
+    data: Path | None = None
+    """Demonstrations (robomimic HDF5); datasets/TASK.hdf5 by default."""
     attempts: Path | None = None
     """The policy's own rollouts, failed and successful (robomimic HDF5)."""
-    out: Path
-    """Folder of the run: checkpoint, state to go on from, log."""
+    out: Path | None = None
+    """Folder of the run: checkpoint, state to go on from, log; the policy's by default."""
     demonstrations: int | None = None
     """How many demonstrations to use; all by default."""
     iterations: int | None = None
     """Gradient steps; the paper's by default."""
     seed: int = 0
-    threads: int | None = None
-    """Torch threads; torch's own choice by default."""
+    threads: int = 2
+    """torch threads."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -40,16 +43,16 @@ def main(arguments: Sequence[str]) -> int:
     from far_app.learning.policy import load_policy
     from far_app.learning.train_critic import CriticTraining, train_critic
 
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    if options.threads is not None:
-        torch.set_num_threads(options.threads)
-    policy = load_policy(options.policy)
+    torch.set_num_threads(options.threads)
+    path = options.policy or Path("runs") / f"{options.task}-quickstart" / "policy.safetensors"
+    policy = load_policy(path, options.task)
     training = CriticTraining(seed=options.seed)
     if options.iterations is not None:
         training = dataclasses.replace(training, iterations=options.iterations)
     cameras = policy.config.cameras
-    demonstrations = read_episodes(options.demos, cameras, options.demonstrations)
+    data = options.data or Path("datasets") / f"{options.task}.hdf5"
+    demonstrations = read_episodes(data, cameras, options.demonstrations)
     attempts = read_episodes(options.attempts, cameras) if options.attempts is not None else []
-    checkpoint = train_critic(demonstrations, attempts, policy, training, options.out)
-    print(f"critic checkpoint: {checkpoint}")
+    checkpoint = train_critic(demonstrations, attempts, policy, training, options.out or path.parent)
+    log.info("wrote %s", checkpoint)
     return 0

@@ -1,4 +1,4 @@
-"""`far train policy`: the diffusion policy from demonstrations. Interrupted, it goes on where it was."""
+"""`far train policy`: behaviour cloning from demonstrations, resumable."""
 
 from __future__ import annotations
 
@@ -10,60 +10,63 @@ from pathlib import Path
 
 import tyro
 
-from far_app.errors import ConfigError
-from far_app.tasks import task as find_task
+from far_app.errors import CheckpointError
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainPolicyOptions:
-    """Train the diffusion policy on demonstrations; the same command goes on where it was interrupted."""
+    """Train the diffusion policy; a second start goes on where the first one stopped."""
 
-    demos: Path
-    """Demonstrations (robomimic HDF5), as `far demo` writes them."""
-    out: Path
-    """Folder of the run: checkpoint, state to go on from, log."""
     task: str = "lift"
     preset: str = "quickstart"
     """quickstart or paper."""
+    data: Path | None = None
+    """Demonstrations (robomimic HDF5); datasets/TASK.hdf5 by default."""
     demonstrations: int | None = None
-    """How many to use; all by default."""
+    """Use the first so many of them."""
+    out: Path | None = None
+    """Folder of the run; runs/TASK-PRESET by default."""
     iterations: int | None = None
-    """Gradient steps; the preset's by default."""
-    batch: int | None = None
-    lr: float | None = None
+    """The preset's number by default."""
     seed: int = 0
     device: str = "cpu"
+    threads: int = 2
+    """torch threads."""
     imagenet: Path | None = None
-    """torchvision's resnet18 weights file for the paper's encoder."""
-    threads: int | None = None
-    """Torch threads; torch's own choice by default."""
+    """torchvision's resnet18 weights as safetensors (paper preset)."""
 
 
 def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(TrainPolicyOptions, args=list(arguments), prog="far train policy")
-    find_task(options.task)
     import torch
 
     from far_app.cli.assemble import check_device
     from far_app.learning.dataset import read_episodes
+    from far_app.learning.imagenet import resnet18_weights
     from far_app.learning.policy import preset
     from far_app.learning.train_policy import TRAININGS, train_policy
+    from far_app.tasks import task as find_task
 
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    config = preset(options.preset, options.task)
     check_device(options.device)
-    if options.threads is not None:
-        torch.set_num_threads(options.threads)
-    given = {k: getattr(options, k) for k in ("iterations", "batch", "lr") if getattr(options, k) is not None}
-    training = dataclasses.replace(TRAININGS[options.preset], seed=options.seed, **given)
-    imagenet = None
-    if options.imagenet is not None:
-        if not options.imagenet.exists():
-            raise ConfigError(
-                f"no ImageNet weights at {options.imagenet}; give torchvision's resnet18 file or leave it out"
-            )
-        imagenet = torch.load(options.imagenet, map_location="cpu", weights_only=True)
-    episodes = read_episodes(options.demos, config.cameras, options.demonstrations)
-    checkpoint = train_policy(episodes, config, training, options.out, options.device, imagenet=imagenet)
-    print(f"policy checkpoint: {checkpoint}")
+    torch.set_num_threads(options.threads)
+    task = find_task(options.task)
+    config = preset(options.preset, task.name)
+    training = dataclasses.replace(TRAININGS[options.preset], seed=options.seed)
+    if options.iterations is not None:
+        training = dataclasses.replace(training, iterations=options.iterations)
+    weights = None
+    if config.encoder == "resnet18":
+        try:
+            weights = resnet18_weights(options.imagenet)
+        except CheckpointError as error:
+            log.warning("%s; training starts from random weights", error)
+    episodes = read_episodes(
+        options.data or Path("datasets") / f"{task.name}.hdf5", config.cameras, options.demonstrations
+    )
+    folder = options.out or Path("runs") / f"{task.name}-{options.preset}"
+    card: dict[str, object] = {"command": "far train policy " + " ".join(arguments)}
+    path = train_policy(episodes, config, training, folder, options.device, card, weights)
+    log.info("wrote %s", path)
     return 0

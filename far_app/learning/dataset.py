@@ -1,10 +1,10 @@
 """Demonstrations on disk (robomimic's HDF5 layout) and in memory.
 
-    data/demo_N                 attrs: num_samples, seed, success
-        actions (N, 7)   rewards (N,)   dones (N,)
-        obs/front_image, obs/wrist_image (N, S, S, 3) uint8
-        obs/robot0_eef_pos (N, 3)  obs/robot0_eef_quat (N, 4) xyzw  obs/robot0_gripper (N, 1)  obs/object (N, K)
-    data attrs: total, env_args (JSON with env_name, type, env_kwargs)
+data/demo_N                 attrs: num_samples, seed, success
+    actions (N, 7)   rewards (N,)   dones (N,)
+    obs/front_image, obs/wrist_image (N, S, S, 3) uint8
+    obs/robot0_eef_pos (N, 3)  obs/robot0_eef_quat (N, 4) xyzw  obs/robot0_gripper (N, 1)  obs/object (N, K)
+data attrs: total, env_args (JSON with env_name, type, env_kwargs)
 """
 
 from __future__ import annotations
@@ -69,6 +69,15 @@ def count_episodes(path: Path) -> int:
         return len(file["data"]) if "data" in file else 0
 
 
+def last_scene(path: Path) -> int:
+    """How many scenes a file has used, relative to its first one; 0 when there is no file."""
+    if not path.exists():
+        return 0
+    with h5py.File(path, "r") as file:
+        seeds = [int(group.attrs["seed"]) for group in file["data"].values()] if "data" in file else []
+    return max(seeds) - min(seeds) + 1 if seeds else 0
+
+
 def read_episodes(path: Path, cameras: tuple[str, ...], limit: int | None = None) -> list[Episode]:
     """The first `limit` demonstrations, decoded."""
     if not path.exists():
@@ -80,7 +89,9 @@ def read_episodes(path: Path, cameras: tuple[str, ...], limit: int | None = None
             group = file["data"][name]
             missing = [c for c in cameras if f"{c}_image" not in group["obs"]]
             if missing:
-                raise RecordingError(f"{path}:{name} has no images of {', '.join(missing)}; it has {list(group['obs'])}")
+                raise RecordingError(
+                    f"{path}:{name} has no images of {', '.join(missing)}; it has {list(group['obs'])}"
+                )
             states = np.concatenate(
                 [group["obs"][k][:] for k in ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper")], axis=1
             )

@@ -1,7 +1,7 @@
 """DDPM training noise and DDIM sampling: 100 steps, squared-cosine schedule, ε-prediction, x₀ clipped to [−1, 1].
 
-    a_k = √ᾱ_k a_0 + √(1 − ᾱ_k) ε                                   (Ho et al. 2020)
-    a_{k'} = √ᾱ_{k'} â_0 + √(1 − ᾱ_{k'}) ε̂                          (Song et al. 2021, η = 0)
+a_k = √ᾱ_k a_0 + √(1 − ᾱ_k) ε                                   (Ho et al. 2020)
+a_{k'} = √ᾱ_{k'} â_0 + √(1 − ᾱ_{k'}) ε̂                          (Song et al. 2021, η = 0)
 """
 
 from __future__ import annotations

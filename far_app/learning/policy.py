@@ -173,7 +173,9 @@ def load_policy(path: Path, task: str | None = None, device: str = "cpu") -> Dif
             metadata = file.metadata() or {}
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path} is truncated or not a safetensors file ({error}); copy or train it again") from error
+        raise CheckpointError(
+            f"{path} is truncated or not a safetensors file ({error}); copy or train it again"
+        ) from error
     if metadata.get("format") != FORMAT:
         raise CheckpointError(f"{path} holds format {metadata.get('format')!r}, a policy has {FORMAT!r}")
     raw = json.loads(metadata["config"])

@@ -27,6 +27,7 @@ from far_app.learning.dataset import Episode
 from far_app.learning.diffusion import TRAIN_STEPS, add_noise
 from far_app.learning.policy import DiffusionPolicy, PolicyConfig, save_policy
 from far_app.learning.resume import load_state, optimizer_tensors, restore_optimizer, save_state
+from far_app.learning.trainable import Trainable, trainable
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +61,7 @@ class PolicyTraining:
 
 TRAININGS = {
     "paper": PolicyTraining(),
-    "quickstart": PolicyTraining(iterations=6_000, batch=96, draws=2, lr=5e-4, lr_end=2e-5),
+    "quickstart": PolicyTraining(iterations=4_000, batch=64, draws=2, lr=5e-4, lr_end=2e-5),
 }
 
 
@@ -82,9 +83,7 @@ class DemonstrationArrays:
         self.ends = np.repeat(self.starts + self.lengths - 1, self.lengths)
         """Row of the last tick of each row's episode."""
 
-    def segments(
-        self, count: int, length: int, rng: np.random.Generator
-    ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    def segments(self, count: int, length: int, rng: np.random.Generator) -> tuple[dict[str, Tensor], Tensor, Tensor]:
         """`count` segments of `length` ticks: frames (count, length + n_obs − 1, S, S, 3), states, chunks
         (count, length, H, A). Ticks before an episode's first repeat it, actions past its last repeat it."""
         n_obs, horizon, size = self.config.n_obs, self.config.horizon, self.config.image_size
@@ -126,12 +125,24 @@ def segment_features(policy: DiffusionPolicy, images: dict[str, Tensor], states:
     return encoder.join(parts, state)
 
 
-def denoising_loss(policy: DiffusionPolicy, features: Tensor, chunks: Tensor, generator: torch.Generator, draws: int) -> Tensor:
+def denoising_loss(
+    denoiser: Trainable, features: Tensor, chunks: Tensor, generator: torch.Generator, draws: int
+) -> Tensor:
     """E ‖ε − ε_θ(a_k, s, k)‖², averaged over entries."""
-    chunks, features = chunks.repeat(draws, 1, 1), features.repeat(draws, 1)
+    chunks, condition = chunks.repeat(draws, 1, 1), denoiser.condition(features).repeat(draws, 1)
     k = torch.randint(0, TRAIN_STEPS, (len(chunks),), generator=generator).to(chunks.device)
     noise = torch.randn(chunks.shape, generator=generator).to(chunks.device)
-    return (policy.denoiser(add_noise(chunks, noise, k), k, features) - noise).square().mean()
+    return (denoiser.run(add_noise(chunks, noise, k), k, condition) - noise).square().mean()
+
+
+def backward(loss: Tensor, denoiser: Trainable) -> None:
+    """Gradients of the loss on the encoder's and the denoiser's own weights."""
+    loss.backward()
+    flat = denoiser.pull_back([torch.zeros_like(m) if m.grad is None else m.grad for m in denoiser.leaves])
+    for parameter, gradient in zip(
+        denoiser.parameters, flat.split([p.numel() for p in denoiser.parameters]), strict=True
+    ):
+        parameter.grad = gradient.view_as(parameter)
 
 
 def learning_rate(config: PolicyTraining, iteration: int) -> float:
@@ -143,10 +154,15 @@ def learning_rate(config: PolicyTraining, iteration: int) -> float:
 
 
 def train_policy(
-    episodes: Sequence[Episode], config: PolicyConfig, training: PolicyTraining, folder: Path, device: str = "cpu",
-    card: dict[str, object] | None = None, imagenet: dict[str, Tensor] | None = None,
+    episodes: Sequence[Episode],
+    config: PolicyConfig,
+    training: PolicyTraining,
+    folder: Path,
+    device: str = "cpu",
+    card: dict[str, object] | None = None,
+    imagenet: dict[str, Tensor] | None = None,
 ) -> Path:
-    """Train (or go on training) in a folder; returns the checkpoint (EMA weights). One line per interval in log.jsonl."""
+    """Train (or go on training) in a folder; returns the checkpoint (EMA weights). log.jsonl has one line an interval."""
     torch.manual_seed(training.seed)
     rng = np.random.default_rng(training.seed)
     generator = torch.Generator().manual_seed(training.seed)
@@ -160,11 +176,12 @@ def train_policy(
     optimizer = torch.optim.AdamW(
         policy.parameters(), lr=training.lr, betas=(0.95, 0.999), weight_decay=training.weight_decay
     )
+    denoiser = trainable(policy.denoiser, config.horizon)
     state_path = folder / "state.safetensors"
     done = 0
     if state_path.exists():
         tensors, notes = load_state(state_path)
-        if notes["training"] != dataclasses.asdict(training):
+        if notes["training"] != json.loads(json.dumps(dataclasses.asdict(training))):
             raise ConfigError(f"{folder} holds a run with other settings; choose another --out or delete it")
         policy.load_state_dict({k[7:]: v for k, v in tensors.items() if k.startswith("policy.")})
         ema.load_state_dict({k[4:]: v for k, v in tensors.items() if k.startswith("ema.")})
@@ -192,14 +209,15 @@ def train_policy(
         images, states, chunks = arrays.segments(training.batch // training.segment, training.segment, rng)
         images = {c: v.to(device, non_blocking=True) for c, v in images.items()}
         features = segment_features(policy, images, states.to(device))
-        loss = denoising_loss(policy, features, chunks.flatten(0, 1).to(device), generator, training.draws)
+        denoiser.refresh()
+        loss = denoising_loss(denoiser, features, chunks.flatten(0, 1).to(device), generator, training.draws)
         if not torch.isfinite(loss):
             raise PolicyError(
                 f"the loss became {loss.item()} at iteration {iteration}; the last good state is {state_path}; "
                 "lower --lr and start again"
             )
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        backward(loss, denoiser)
         optimizer.step()
         decay = 1.0 - (1 + iteration) ** -training.ema_power
         with torch.no_grad():
@@ -228,4 +246,6 @@ def load_imagenet(policy: DiffusionPolicy, weights: dict[str, Tensor]) -> None:
     for nets in policy.encoder.nets.values():
         for net in nets:  # type: ignore[attr-defined]
             own = net.state_dict()
-            net.load_state_dict({k: trunk[k] if k in trunk and trunk[k].shape == v.shape else v for k, v in own.items()})
+            net.load_state_dict(
+                {k: trunk[k] if k in trunk and trunk[k].shape == v.shape else v for k, v in own.items()}
+            )

@@ -6,6 +6,7 @@ Down widths [64, 128, 256], kernel 3, a 16-d step embedding, FiLM conditioning o
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import torch
@@ -61,7 +62,7 @@ class ConditionalUnet1d(nn.Module):
         condition = step_dim + features
         sizes = [action_dim, *widths]
         self.downs = nn.ModuleList()
-        for i, (inner, outer) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+        for i, (inner, outer) in enumerate(itertools.pairwise(sizes)):
             last = i == len(widths) - 1
             self.downs.append(nn.ModuleList([
                 ResidualBlock(inner, outer, condition, kernel, groups),

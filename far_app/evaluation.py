@@ -1,0 +1,150 @@
+"""Compare ways to retry from the same scenes, in lockstep: one JSONL line an episode, resumable, on several cores.
+
+Diffusion noise is keyed by (scene, attempt, tick), scenes come from seeds and homing is the same, so attempt 1 is
+identical for every method: a scene solved at the first attempt is solved for all, and is run once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from far_app.config import RetryConfig
+from far_app.errors import ConfigError
+from far_app.protocols import Method
+from far_app.types import Trial
+
+Job = tuple[int, dict[str, dict[str, Any]]]
+"""A scene, and what is already known of it by arm."""
+DEV_SCENES = 20_000
+"""Scene seeds for choices (settings, variants)."""
+REPORT_SCENES = 30_000
+"""Scene seeds for reported results; never used for a choice."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arm:
+    """One column of the comparison."""
+
+    name: str
+    method: str
+    retry: RetryConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationPlan:
+    """What to run; written beside the results, so that results of another plan are never mixed in."""
+
+    task: str
+    rig: str
+    policy: str
+    critic: str
+    arms: tuple[Arm, ...]
+    first_scene: int
+    scenes: int
+    max_attempts: int
+
+    def fingerprint(self) -> dict[str, Any]:
+        """Everything but the number of scenes, which may grow."""
+        record = json.loads(json.dumps(dataclasses.asdict(self)))
+        record.pop("scenes")
+        return record
+
+
+def episode_record(arm: str, scene: int, result: Trial, seconds: float) -> dict[str, Any]:
+    """One line of the results."""
+    return {
+        "arm": arm, "scene": scene, "success": result.success, "attempts": len(result.attempts),
+        "ticks": [len(a.steps) for a in result.attempts],
+        "adaptations": [
+            {
+                "status": a.status, "pairs": a.pairs, "empty": a.empty_states, "flagged": len(a.flagged),
+                "winner": [s.winner_error for s in a.history[:: max(1, len(a.history) - 1)]],
+                "loser": [s.loser_error for s in a.history[:: max(1, len(a.history) - 1)]],
+                "seconds": sum(a.seconds.values()),
+            }
+            for a in result.adaptations
+        ],
+        "seconds": seconds,
+    }  # fmt: skip
+
+
+def run_scene(
+    scene: int, arms: dict[str, Method], done: dict[str, dict[str, Any]], run: Callable[[Method, int], Trial]
+) -> Iterator[dict[str, Any]]:
+    """The records of one scene that are still missing; a first-attempt success of one arm is every arm's."""
+    shared = next((r for r in done.values() if r["success"] and r["attempts"] == 1), None)
+    for name, method in arms.items():
+        if name in done:
+            continue
+        if shared is not None:
+            yield shared | {"arm": name, "seconds": 0.0, "shared": True}
+            continue
+        started = time.monotonic()
+        record = episode_record(name, scene, run(method, scene), time.monotonic() - started)
+        if record["success"] and record["attempts"] == 1:
+            shared = record
+        yield record
+
+
+def read_results(path: Path) -> list[dict[str, Any]]:
+    """Whole lines of a results file; a torn last line (a killed run) is left out."""
+    if not path.exists():
+        return []
+    records = []
+    for line in path.read_text().splitlines():
+        try:
+            records.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return records
+
+
+def prepare(folder: Path, plan: EvaluationPlan) -> dict[int, dict[str, dict[str, Any]]]:
+    """What a folder already holds, by scene and arm; ConfigError when it is another plan's."""
+    folder.mkdir(parents=True, exist_ok=True)
+    note = folder / "plan.json"
+    if note.exists() and json.loads(note.read_text()) != plan.fingerprint():
+        raise ConfigError(f"{folder} holds results of another plan ({note}); give another --out or delete it")
+    note.write_text(json.dumps(plan.fingerprint(), indent=1))
+    found: dict[int, dict[str, dict[str, Any]]] = {}
+    for record in read_results(folder / "episodes.jsonl"):
+        found.setdefault(record["scene"], {})[record["arm"]] = record
+    return found
+
+
+def evaluate(
+    folder: Path, plan: EvaluationPlan, workers: int, progress: Callable[[dict[str, Any]], None],
+    begin: Callable[[EvaluationPlan], None], work: Callable[[Job], list[dict[str, Any]]],
+) -> None:  # fmt: skip
+    """Run what is missing; every finished scene is on disk before the next is counted. `begin` sets a worker process
+    up, `work` runs one scene in it; both are importable functions (far_app/cli/evaluate.py)."""
+    found = prepare(folder, plan)
+    names = {a.name for a in plan.arms}
+    scenes = range(plan.first_scene, plan.first_scene + plan.scenes)
+    jobs = [(s, found.get(s, {})) for s in scenes if names - set(found.get(s, {}))]
+    with (folder / "episodes.jsonl").open("a") as file:
+        for records in _results(plan, jobs, workers, begin, work):
+            for record in records:
+                file.write(json.dumps(record) + "\n")
+                file.flush()
+                progress(record)
+
+
+def _results(
+    plan: EvaluationPlan, jobs: Sequence[Job], workers: int, begin: Callable, work: Callable
+) -> Iterator[list[dict[str, Any]]]:
+    if workers <= 1 or not jobs:
+        if jobs:
+            begin(plan)
+        yield from map(work, jobs)
+        return
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(min(workers, len(jobs)), initializer=begin, initargs=(plan,)) as pool:
+        yield from pool.imap_unordered(work, jobs)

@@ -1,0 +1,87 @@
+"""The policy that acts: a DiffusionPolicy, its version, and the critic's V(s_t), behind far_app.protocols.Policy.
+
+An observation's camera features are computed once, where the encoder shares its weights over the frames: the next tick
+finds the previous frame's already there. Noise comes from outside, so that methods and runs can be compared.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from far_app.errors import PolicyError
+from far_app.learning.critic import Critic
+from far_app.learning.diffusion import ddim_sample
+from far_app.learning.policy import DiffusionPolicy, proprioception
+from far_app.learning.trainable import trainable
+from far_app.protocols import History, PolicySpec
+from far_app.types import ActionChunk, Observation
+
+KEPT_FRAMES = 64
+"""Observations whose camera features are kept: a history each for a few dozen robots."""
+
+
+class ActingPolicy:
+    """far_app.protocols.Policy for one version of the weights. Not for several threads at once."""
+
+    def __init__(self, network: DiffusionPolicy, version: str, critic: Critic | None = None) -> None:
+        self.network, self.critic, self.version = network, critic, version
+        self.spec: PolicySpec = network.spec()
+        self.device = network.normalizer.low.device
+        self._denoiser = trainable(network.denoiser, network.config.horizon, train=False)
+        self._kept: OrderedDict[int, tuple[Observation, list[Tensor]]] = OrderedDict()
+
+    def plan(
+        self, histories: Sequence[History], ticks: Sequence[int], noise: Float[np.ndarray, "B H A"]
+    ) -> list[ActionChunk]:
+        with torch.inference_mode():
+            features = self.features(histories)
+            condition = self._denoiser.condition(features)
+            start = torch.from_numpy(np.ascontiguousarray(noise, np.float32)).to(self.device)
+            chunks = ddim_sample(self._denoiser.run, condition, start, self.network.config.ddim_steps).cpu().numpy()
+            values = (
+                self.critic.value(features).cpu().numpy() if self.critic is not None else np.full(len(ticks), np.nan)
+            )
+        if not np.isfinite(chunks).all():
+            raise PolicyError(
+                f"policy {self.spec.name} ({self.version}) planned a non-finite action at tick {ticks[0]}; check its "
+                "training or go back to another checkpoint"
+            )
+        return [
+            ActionChunk(tick=tick, actions=chunk, policy_version=self.version, value=float(value))
+            for tick, chunk, value in zip(ticks, chunks, values, strict=True)
+        ]
+
+    def features(self, histories: Sequence[History]) -> Float[Tensor, "B F"]:
+        """Features of each history, every shared frame encoded once."""
+        network = self.network
+        if network.encoder.per_frame:
+            return network.encode(histories)
+        self._encode_new([o for h in histories for o in h])
+        frames = [
+            [torch.cat([self._kept[id(h[t])][1][c] for h in histories]) for c in range(len(network.config.cameras))]
+            for t in range(network.config.n_obs)
+        ]
+        state = torch.from_numpy(np.stack([np.stack([proprioception(o) for o in h]) for h in histories])).to(
+            self.device
+        )
+        return network.encoder.join(frames, network.normalizer(state))
+
+    def _encode_new(self, observations: Sequence[Observation]) -> None:
+        new = list({id(o): o for o in observations if id(o) not in self._kept}.values())
+        if new:
+            per_camera = [
+                self.network.encoder.camera_features(
+                    c, 0, torch.from_numpy(np.stack([o.images[c] for o in new])).to(self.device)
+                )
+                for c in self.network.config.cameras
+            ]
+            for i, observation in enumerate(new):
+                self._kept[id(observation)] = (observation, [f[i : i + 1] for f in per_camera])
+        while len(self._kept) > max(KEPT_FRAMES, 2 * len(observations)):
+            self._kept.popitem(last=False)
