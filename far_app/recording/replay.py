@@ -32,6 +32,20 @@ WriteRrd = Callable[[AttemptRecording, Path], None]
 LOOPBACK = "127.0.0.1"
 
 
+def replay(
+    path: Path,
+    write_rrd: WriteRrd,
+    *,
+    web: bool = False,
+    port: int = 9090,
+    announce: Callable[[str], None] = lambda url: None,
+) -> None:
+    """`far replay PATH`: a session, one attempt of it, a folder of sessions (the newest) or an .rrd, in the viewer.
+    The .rrd files are made first, so that they are there even where no viewer can open. Raises FarError."""
+    rrds = [path] if path.suffix == ".rrd" else make_rrds(path, write_rrd)
+    open_viewer(rrds, web=web, port=port, announce=announce)
+
+
 def rrd_path(attempt: Path) -> Path:
     """Where an attempt's .rrd lies: beside its recording."""
     return attempt.with_suffix(".rrd")

@@ -13,7 +13,7 @@ import pytest
 
 from far_app.errors import ConfigError, RecordingError
 from far_app.recording.reader import AttemptRecording
-from far_app.recording.replay import lacking_rrd, make_rrd, make_rrds, open_viewer, rrd_path, viewer_command
+from far_app.recording.replay import lacking_rrd, make_rrd, make_rrds, open_viewer, replay, rrd_path, viewer_command
 
 from . import sessions
 
@@ -67,8 +67,10 @@ def test_an_attempt_that_is_still_written_waits(tmp_path: Path) -> None:
 def test_without_a_display_the_error_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    folder = sessions.small_session(tmp_path, steps=2)
     with pytest.raises(ConfigError, match=r"no display .* add --web"):
-        open_viewer([tmp_path / "a.rrd"])
+        replay(folder, write_steps)
+    assert rrd_path(folder / "trial_0001/attempt_1.mcap").exists(), "the files are made all the same"
 
 
 def test_a_port_in_use_is_named(tmp_path: Path) -> None:
