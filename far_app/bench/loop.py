@@ -26,7 +26,7 @@ from far_app.cli.options import RunOptions
 from far_app.cli.stage import Stage, stage
 from far_app.errors import ConfigError, FarError
 from far_app.protocols import Method
-from far_app.session.adaptation import BackgroundAdaptation
+from far_app.session.adaptation import BackgroundAdaptation, unchanged
 from far_app.session.inbox import IntentInbox
 from far_app.session.realtime import LOOP_NICENESS
 from far_app.session.statistics import LoopStatistics, percentiles
@@ -74,9 +74,9 @@ def measure(options: LoopOptions) -> dict[str, Any]:
         with stage(run) as stage_, client(stage_.page_url, options.seconds) as connected:
             half = options.seconds / 2
             with floor(stage_.task.rate) as woken:
-                idle, attempt, idle_span = session(stage_, half)
+                idle, attempt, idle_span = naive_session(stage_, half)
                 with learning_all_along(stage_.parts.method, attempt) as rounds:
-                    adapting, _, adapting_span = session(stage_, half)
+                    adapting, _, adapting_span = naive_session(stage_, half)
     return {
         "seconds": options.seconds,
         "page_client": connected,
@@ -86,23 +86,23 @@ def measure(options: LoopOptions) -> dict[str, Any]:
     }
 
 
-def session(stage_: Stage, seconds: float) -> tuple[LoopStatistics, Attempt, tuple[float, float]]:
-    """Trials under naive retry for so long; returns the last whole attempt too, and when it was."""
+def naive_session(stage_: Stage, seconds: float) -> tuple[LoopStatistics, Attempt, tuple[float, float]]:
+    """Trials under naive retry for so long; returns the last failed attempt too, and when it was."""
     statistics, inbox = LoopStatistics(), IntentInbox()
     began = time.monotonic()
     timer = threading.Timer(seconds, inbox.put, (Intent.QUIT,))
     timer.daemon = True
-    with stage_.session(stage_.writer(), inbox, statistics, method=_Unlearning(stage_.parts.method)) as session_:
+    with stage_.session(stage_.writer(), inbox, statistics, method=Unlearning(stage_.parts.method)) as session_:
         timer.start()
         session_.run()
     if session_.recorder.error is not None:
         raise session_.recorder.error
-    if session_.last_attempt is None:
-        raise FarError(f"no attempt was completed within {seconds:g} s; measure for longer")
-    return statistics, session_.last_attempt, (began, time.monotonic())
+    if session_.last_failure is None:
+        raise FarError(f"no attempt failed within {seconds:g} s, so there is nothing to adapt from; measure for longer")
+    return statistics, session_.last_failure, (began, time.monotonic())
 
 
-class _Unlearning:
+class Unlearning:
     """The base policy of a method, tried again unchanged: what runs in both halves."""
 
     def __init__(self, method: Method) -> None:
@@ -113,8 +113,6 @@ class _Unlearning:
     def begin(self, scene_seed: int) -> None: ...
 
     def adapt(self, attempt: Attempt, cancelled: Any, progress: Any) -> Any:
-        from far_app.session.adaptation import unchanged
-
         return unchanged(self.policy.version, "none")
 
 

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from far_app.config import RetryConfig, TaskConfig
 from far_app.errors import CheckpointError, ConfigError
 from far_app.protocols import Method, PolicySpec
 from far_app.types import Observation
 
+if TYPE_CHECKING:
+    from far_app.learning.critic import Critic
+    from far_app.learning.policy import DiffusionPolicy
+
+UNTRAINED = "untrained:"
+"""--policy untrained:PRESET gives random weights."""
 CHECKPOINTS = Path(__file__).parent.parent / "checkpoints"
 """The shipped quickstart model: {task}.policy.safetensors and {task}.critic.safetensors."""
 
@@ -39,8 +46,6 @@ def assemble(
 
         return Parts(method=ScriptedMethod(policy.removeprefix("test:")), policy_name=policy, max_attempts=None)
 
-    from far_app.learning.critic_file import load_critic
-    from far_app.learning.policy import load_policy
     from far_app.learning.runtime import ActingPolicy
     from far_app.methods import METHODS, Ingredients
     from far_app.methods import method as make_method
@@ -49,10 +54,14 @@ def assemble(
         raise ConfigError(f"unknown method '{method}'; choose one of: {', '.join(METHODS)}")
     entry = METHODS[method]
     check_device(device)
-    path = Path(policy) if policy is not None else shipped(task.name, "policy")
-    network = load_policy(path, task.name, device)
-    critic_path = critic or (shipped(task.name, "critic") if policy is None else path.with_name("critic.safetensors"))
-    critic_network = load_critic(critic_path, network) if entry.needs_critic or critic_path.exists() else None
+    if policy is not None and policy.startswith(UNTRAINED):
+        name = policy
+        network, critic_network = untrained(policy.removeprefix(UNTRAINED), task.name, device)
+    else:
+        path = Path(policy) if policy is not None else shipped(task.name, "policy")
+        beside = shipped(task.name, "critic") if policy is None else path.with_name("critic.safetensors")
+        name = str(path)
+        network, critic_network = trained(path, critic or beside, task.name, device, entry.needs_critic)
     made = make_method(
         method,
         Ingredients(
@@ -60,7 +69,35 @@ def assemble(
             act=lambda net, version: ActingPolicy(net, version, critic_network),
         ),
     )  # fmt: skip
-    return Parts(method=made, policy_name=str(path), max_attempts=entry.attempts)
+    return Parts(method=made, policy_name=name, max_attempts=entry.attempts)
+
+
+def trained(
+    policy: Path, critic: Path, task: str, device: str, needs_critic: bool
+) -> tuple[DiffusionPolicy, Critic | None]:
+    """Networks from checkpoints; the critic where it is needed or there. Raises CheckpointError."""
+    from far_app.learning.critic_file import load_critic
+    from far_app.learning.policy import load_policy
+
+    network = load_policy(policy, task, device)
+    return network, load_critic(critic, network).to(device) if needs_critic or critic.exists() else None
+
+
+def untrained(preset: str, task: str, device: str) -> tuple[DiffusionPolicy, Critic]:
+    """Networks of a preset's architecture with random weights, the same each time: for measurements, where only the
+    arithmetic counts."""
+    import torch
+
+    from far_app.learning.critic import Critic, CriticShape
+    from far_app.learning.policy import DiffusionPolicy
+    from far_app.learning.policy import preset as preset_config
+
+    torch.manual_seed(0)
+    network = DiffusionPolicy(preset_config(preset, task)).to(device).eval().requires_grad_(False)
+    shape = CriticShape(
+        features=network.feature_dim, horizon=network.config.horizon, action_dim=network.spec().action_dim
+    )
+    return network, Critic(shape).to(device).eval().requires_grad_(False)
 
 
 def check_device(device: str) -> None:

@@ -9,6 +9,7 @@ Called by `far run` and `far bench loop`. Whatever ends it, the arm is held and 
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import dataclass, field, replace
 
 from far_app.config import TaskConfig
@@ -90,8 +91,9 @@ class Session:
             clock=self.clock, publisher=publisher, freshness=settings.freshness, headless=settings.headless,
         )  # fmt: skip
         self.results: list[TrialResult] = []
-        self.last_attempt: Attempt | None = None
-        """The newest attempt that has ended."""
+        self.last_failure: Attempt | None = None
+        """The newest failed attempt."""
+        self._ended = float("nan")
         self._adaptation: BackgroundAdaptation | None = None
         self._attempts: list[Attempt] = []
         self._adaptations: list[Adaptation] = []
@@ -191,6 +193,8 @@ class Session:
         self._recorded = self._tick = 0
         self._in_attempt = True
         self._prime()
+        if event.attempt_index > 1:
+            self.statistics.homing.append(time.monotonic() - self._ended)
         self.clock.restart()
 
     def _attempt_ended(self, event: AttemptEnded) -> None:
@@ -201,7 +205,8 @@ class Session:
         self.recorder.end_attempt(attempt)
         self._in_attempt = False
         self._attempts.append(attempt)
-        self.last_attempt = attempt
+        self.last_failure = self.last_failure if attempt.outcome.success else attempt
+        self._ended = time.monotonic()
         word = "success" if attempt.outcome.success else "failure"
         supervision.say(f"attempt {attempt.index}: {word} by {attempt.outcome.judged_by}, {len(attempt.steps)} ticks")
         supervision.rest()

@@ -28,6 +28,8 @@ class LoopStatistics:
         """Ticks between the newest chunk's observation and the tick it shaped."""
         self.observation_age = array.array("d")
         """Seconds between an observation's capture and the tick that acted on it."""
+        self.homing = array.array("d")
+        """Seconds from an attempt's end to the next one's start."""
         self.ticks = 0
         self.starved = 0
         self.overruns = 0

@@ -38,8 +38,8 @@ class TrialAbandoned(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class Freshness:
-    stale_after: float = 0.2
-    """Age of an observation, seconds, at which the arm is held."""
+    stale_after: float = 0.25
+    """Age of an observation's pictures, seconds, at which the arm is held."""
     limit: float = 1.0
     """Seconds of staleness after which it is a fault."""
 
@@ -177,8 +177,9 @@ class Supervision:
         while self.robot.age() > self.freshness.stale_after and self.state is State.RUNNING:
             if time.monotonic() - began > self.freshness.limit:
                 self.fault(
-                    f"no fresh observation for {self.robot.age():.1f} s (limit {self.freshness.limit:g} s): the "
-                    "hardware server or a camera stopped; look at it, then press Resume"
+                    f"observations were stale for {time.monotonic() - began:.1f} s (limit {self.freshness.limit:g} s), "
+                    f"the newest is {self.robot.age():.2f} s old (fresh is {self.freshness.stale_after:g} s): the "
+                    "hardware server or a camera stopped, or this machine is too busy; look at it, then press Resume"
                 )
                 return True
             self.show()

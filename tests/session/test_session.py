@@ -212,7 +212,7 @@ def test_trouble_is_a_fault_that_ends_a_headless_session_with_an_error(trouble):
             desk.robot.latch("arm error C31: collision", fault=True)
 
     desk.when(desk.moving, strike)
-    message = {"stale": "no fresh observation", "silent": "hardware server", "arm": "C31", "nan": "non-finite action"}
+    message = {"stale": "observations were stale", "silent": "hardware server", "arm": "C31", "nan": "non-finite action"}
     with pytest.raises(SessionFault, match=message[trouble]):
         desk.session.run()
     (attempt,) = desk.session._attempts
