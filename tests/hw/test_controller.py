@@ -1,0 +1,291 @@
+"""The controller alone: what it commands, tick by tick, to an arm that goes where it is told at once."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from far_app.config import TaskConfig
+from far_app.errors import RobotError
+from far_app.protocols import Heartbeat, Hold, Home, Resume
+from far_app.tasks import task
+from far_app.types import Pose, RobotMode, Target
+from hw.controller import BREACH, ArmController
+from hw.plant import Measured
+from hw.rig import load_rig
+
+RIG, TASK = load_rig("twin"), task("lift")
+START = Pose(position=np.array(RIG.start_position), quaternion=np.array(RIG.start_quaternion))
+
+
+class Arm:
+    """A controller, its clock, and an arm that is always where it was last told to be, plus an offset."""
+
+    def __init__(self, servo_hz: int = 120, at: Pose = START, task: TaskConfig = TASK) -> None:
+        self.servo_hz, self.ticks = servo_hz, 0
+        self.offset = np.zeros(3)
+        self.measured = Measured(eef=at, joints=np.zeros(7), gripper=1.0)
+        self.controller = ArmController(RIG, task, servo_hz, self.measured)
+        self.commanded = [at]
+        self.gripper = -1.0
+        self.seq = 0
+
+    @property
+    def now(self) -> float:
+        return self.ticks / self.servo_hz
+
+    @property
+    def mode(self) -> RobotMode:
+        return self.controller.mode
+
+    def tick(self, count: int = 1) -> None:
+        for _ in range(count):
+            pose, self.gripper = self.controller.tick(self.now, self.measured)
+            self.commanded.append(pose)
+            opening = self.measured.gripper + np.clip(-self.gripper - self.measured.gripper, -0.02, 0.02)
+            eef = Pose(position=pose.position + self.offset, quaternion=pose.quaternion)
+            self.measured = replace(self.measured, eef=eef, gripper=float(np.clip(opening, 0, 1)))
+            self.ticks += 1
+
+    def target(self, step: tuple[float, float, float] = (0.008, 0.0, 0.0), gripper: float = -1.0) -> str:
+        """Offer the next target; returns its refusal."""
+        self.seq += 1
+        last = self.controller._state.goal if self.mode is RobotMode.TRACKING else self.measured.eef
+        pose = Pose(position=last.position + np.array(step), quaternion=last.quaternion)
+        return self.controller.offer(
+            Target(seq=self.seq, pose=pose, gripper=gripper, created=self.now, expires=self.now + 0.1), self.now
+        ).refused
+
+    def stream(self, targets: int) -> None:
+        for _ in range(targets):
+            assert not self.target()
+            self.tick(round(self.servo_hz / TASK.rate))
+
+    def speed(self) -> float:
+        return math.dist(self.commanded[-1].position, self.commanded[-2].position) * self.servo_hz
+
+    def beat_until(self, what: Callable[[], bool], limit: float = 30.0) -> None:
+        for _ in range(int(limit * self.servo_hz)):
+            self.controller.request(Heartbeat(), self.now)
+            self.tick()
+            if what():
+                return
+        raise AssertionError(f"it never came to that: {self.controller.status()}")
+
+
+@pytest.mark.parametrize("servo_hz", [100, 120, 250])
+def test_the_watchdog_triggers_at_100_ms_and_the_command_stands_still_by_150(servo_hz: int) -> None:
+    arm = Arm(servo_hz)
+    arm.stream(5)
+    arm.target()
+    last = arm.now
+    while arm.mode is RobotMode.TRACKING:
+        arm.tick()
+    assert 0.1 <= arm.now - last <= 0.1 + 2 / servo_hz
+    while arm.speed() > 0:
+        arm.tick()
+    assert arm.now - last <= 0.150
+    assert arm.controller.status().holds == 1
+
+
+def test_a_stop_at_full_speed_stands_still_within_50_ms() -> None:
+    arm = Arm()
+    for _ in range(8):
+        arm.target((0.012, 0, 0))
+        arm.tick(4)
+    assert arm.speed() > 0.3
+    arm.controller.stop("STOP")
+    pressed = arm.now
+    assert arm.controller.status().mode is RobotMode.LATCHED, "at once, before any servo tick"
+    assert "latched (STOP)" in arm.target()
+    arm.tick()
+    while arm.speed() > 0:
+        arm.tick()
+    assert arm.now - pressed < 0.05
+
+
+def test_motion_after_a_hold_starts_from_the_measured_pose() -> None:
+    arm = Arm()
+    arm.stream(5)
+    arm.tick(40)
+    assert arm.mode is RobotMode.HOLD
+    arm.measured = replace(
+        arm.measured, eef=Pose(position=arm.measured.eef.position + (0, 0.03, 0), quaternion=START.quaternion)
+    )
+    arm.tick()
+    pushed = arm.measured.eef.position + (0, 0.03, 0)
+    arm.measured = replace(arm.measured, eef=Pose(position=pushed, quaternion=START.quaternion))
+    assert not arm.target()
+    arm.tick()
+    assert math.dist(arm.commanded[-1].position, pushed) < RIG.safety.speed / arm.servo_hz + 1e-9
+
+
+def test_targets_never_pull_the_command_faster_than_the_limits() -> None:
+    arm = Arm()
+    rng = np.random.default_rng(0)
+    velocity = np.zeros(3)
+    for _ in range(200):
+        arm.target(tuple(rng.normal(size=3) * 0.02))
+        arm.tick(int(rng.integers(1, 8)))
+    for before, after in itertools.pairwise(arm.commanded):
+        new = (after.position - before.position) * arm.servo_hz
+        assert math.hypot(*new) <= RIG.safety.speed + 1e-9
+        assert math.dist(new, velocity) <= RIG.safety.acceleration / arm.servo_hz + 1e-9
+        velocity = new
+
+
+def test_sequence_numbers_begin_anew_with_a_home_request() -> None:
+    arm = Arm()
+    arm.stream(4)
+    arm.seq = 0
+    assert "out of order" in arm.target()
+    arm.controller.request(Home(), arm.now)
+    arm.beat_until(lambda: arm.controller.status().at_home)
+    arm.seq = 0
+    assert not arm.target()
+
+
+def test_an_arm_error_latches_as_a_fault_and_resume_needs_it_gone() -> None:
+    arm = Arm()
+    arm.stream(3)
+    arm.measured = replace(arm.measured, error="C31: collision caused abnormal current")
+    arm.tick()
+    status = arm.controller.status()
+    assert status.mode is RobotMode.LATCHED
+    assert status.fault
+    assert "C31" in status.reason
+    with pytest.raises(RobotError, match="still reports 'C31"):
+        arm.controller.request(Resume(), arm.now)
+    arm.measured = replace(arm.measured, error="")
+    arm.tick(20)
+    assert arm.mode is RobotMode.LATCHED, "errors are never cleared automatically"
+    arm.controller.request(Resume(), arm.now)
+    assert arm.controller.status() == replace(
+        status, mode=RobotMode.HOLD, reason="resumed by the operator", fault=False
+    )
+
+
+def test_a_breach_of_the_workspace_latches_and_after_resume_only_the_way_back_is_open() -> None:
+    arm = Arm()
+    arm.stream(2)
+    low = np.array((RIG.start_position[0], 0.0, RIG.safety.box_max[2] + BREACH + 0.01))
+    arm.measured = replace(arm.measured, eef=Pose(position=low, quaternion=START.quaternion))
+    arm.tick()
+    assert arm.controller.status().fault
+    assert "outside the workspace box" in arm.controller.status().reason
+    arm.offset = low - arm.commanded[-1].position
+    arm.controller.request(Resume(), arm.now)
+    arm.offset = np.zeros(3)
+    arm.measured = replace(arm.measured, eef=Pose(position=low, quaternion=START.quaternion))
+    height = low[2]
+    assert not arm.target((0, 0, 0.008))
+    arm.tick(4)
+    assert arm.measured.eef.position[2] == pytest.approx(height)
+    for _ in range(20):
+        assert not arm.target((0, 0, -0.008))
+        arm.tick(4)
+    assert arm.measured.eef.position[2] < RIG.safety.box_max[2]
+
+
+def test_a_pose_that_is_not_a_number_is_a_fault() -> None:
+    arm = Arm()
+    arm.stream(2)
+    arm.measured = replace(arm.measured, eef=Pose(position=np.full(3, np.nan), quaternion=START.quaternion))
+    before = arm.commanded[-1]
+    pose, _ = arm.controller.tick(arm.now, arm.measured)
+    assert np.isfinite(pose.position).all()
+    assert math.dist(pose.position, before.position) < 0.003
+    assert arm.controller.status().fault
+
+
+def away(task: TaskConfig = TASK, gripper: float = 1.0) -> Arm:
+    """An arm 15 cm from home, hand closed."""
+    arm = Arm(task=task)
+    for _ in range(20):
+        arm.target((0.004, 0.008, 0.0), gripper)
+        arm.tick(4)
+    arm.tick(40)
+    return arm
+
+
+def test_home_opens_retreats_and_returns_smoothly() -> None:
+    arm = away()
+    began, height, first = arm.now, arm.measured.eef.position[2], len(arm.commanded)
+    arm.controller.request(Home(), arm.now)
+    arm.beat_until(lambda: arm.measured.gripper > 0.95)
+    assert arm.measured.eef.position[2] == pytest.approx(height, abs=1e-6), "opens before it moves"
+    arm.beat_until(lambda: arm.controller.status().at_home)
+    heights = [pose.position[2] for pose in arm.commanded[first:]]
+    assert max(heights) == pytest.approx(height + TASK.retreat[2], abs=1e-3)
+    assert arm.now - began < 6.0
+    assert math.dist(arm.measured.eef.position, START.position) < 1e-3
+    speeds = [math.dist(a.position, b.position) * arm.servo_hz for a, b in itertools.pairwise(arm.commanded[first:])]
+    assert max(speeds) <= RIG.home.speed * 1.02
+
+
+def test_homing_at_home_with_an_open_hand_takes_no_detour() -> None:
+    arm = Arm()
+    arm.controller.request(Home(), arm.now)
+    arm.beat_until(lambda: arm.controller.status().at_home)
+    assert arm.now < 0.5
+    assert max(pose.position[2] for pose in arm.commanded) == pytest.approx(START.position[2], abs=1e-6)
+
+
+def test_an_arm_that_does_not_get_home_is_a_fault_that_says_how_far_off() -> None:
+    arm = away()
+    arm.controller.request(Home(), arm.now)
+    arm.offset = np.array((0.02, 0, 0))
+    arm.beat_until(lambda: arm.mode is RobotMode.LATCHED)
+    status = arm.controller.status()
+    assert status.fault
+    assert not status.at_home
+    assert "20 mm" in status.reason
+
+
+def test_homing_waits_for_the_operator_when_the_task_says_ask() -> None:
+    arm = away(task=replace(TASK, release="ask"))
+    arm.controller.request(Home(), arm.now)
+    arm.beat_until(lambda: arm.now > 3.0)
+    assert arm.mode is RobotMode.HOMING
+    assert "take what the hand holds" in arm.controller.status().reason
+    assert arm.gripper == 1.0
+    arm.controller.request(Resume(), arm.now)
+    arm.beat_until(lambda: arm.controller.status().at_home)
+    assert arm.gripper == -1.0
+
+
+def test_lower_then_open_goes_down_before_it_lets_go() -> None:
+    arm = away(task=replace(TASK, release="lower_then_open"))
+    height = arm.measured.eef.position[2]
+    arm.controller.request(Home(), arm.now)
+    arm.beat_until(lambda: arm.gripper < 0)
+    assert arm.measured.eef.position[2] < height - 0.05
+    assert arm.measured.eef.position[2] >= RIG.safety.box_min[2]
+
+
+def test_a_hold_ends_homing_and_a_latch_too() -> None:
+    for hold in (Hold(reason="operator"), Hold(reason="operator", latch=True)):
+        arm = away()
+        arm.controller.request(Home(), arm.now)
+        arm.beat_until(lambda arm=arm: arm.controller.status().homing_progress > 0.3)
+        arm.controller.request(hold, arm.now)
+        arm.tick(30)
+        assert arm.speed() == 0.0
+        arm.controller.request(Heartbeat(), arm.now)
+        arm.tick(30)
+        assert arm.speed() == 0.0
+        assert not arm.controller.status().at_home
+
+
+def test_resume_does_not_swallow_a_stop_that_is_on_its_way() -> None:
+    arm = Arm()
+    arm.controller.stop("STOP")
+    with pytest.raises(RobotError, match="resume again"):
+        arm.controller.request(Resume(), arm.now)
+    arm.tick()
+    assert arm.mode is RobotMode.LATCHED
