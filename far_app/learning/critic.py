@@ -12,11 +12,15 @@ from __future__ import annotations
 
 import copy
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from far_app.learning.policy import DiffusionPolicy
+from far_app.protocols import History
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +34,15 @@ class CriticShape:
     action_dim: int
     """A."""
     hidden: tuple[int, ...] = (256, 256)
+    own_eyes: bool = False
+    """Sees through an encoder of its own (the paper's form), not through the policy's."""
+
+
+def eyes_of(policy: DiffusionPolicy) -> DiffusionPolicy:
+    """A copy of everything in the policy between observation and features."""
+    eyes = copy.deepcopy(policy)
+    del eyes.denoiser
+    return eyes
 
 
 def mlp(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:
@@ -39,14 +52,18 @@ def mlp(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:
 
 
 class Critic(nn.Module):
-    """V head, twin Q heads and their slow copies, on features standardised by fixed statistics."""
+    """V head, twin Q heads and their slow copies, on features standardised by fixed statistics.
+
+    The features are the policy's own, or those of `eyes`: an encoder that began as a copy of the policy's and was
+    trained further."""
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, shape: CriticShape) -> None:
+    def __init__(self, shape: CriticShape, eyes: DiffusionPolicy | None = None) -> None:
         super().__init__()
         self.shape = shape
+        self.eyes = eyes
         chunk = shape.horizon * shape.action_dim
         self.v = mlp(shape.features, shape.hidden, 1)
         self.q1 = mlp(shape.features + chunk, shape.hidden, 1)
@@ -55,6 +72,10 @@ class Critic(nn.Module):
         self.slow_q2 = copy.deepcopy(self.q2).requires_grad_(False)
         self.register_buffer("mean", torch.zeros(shape.features))
         self.register_buffer("std", torch.ones(shape.features))
+
+    def see(self, histories: Sequence[History], features: Float[Tensor, "B F"]) -> Float[Tensor, "B F"]:
+        """What `value` and `q` take, from histories and the policy's features of them."""
+        return features if self.eyes is None else self.eyes.encode(histories)
 
     def standardise(self, features: Float[Tensor, "N F"]) -> None:
         """Fix the input statistics, before training; entries that hardly vary are left unscaled."""

@@ -103,16 +103,18 @@ def select(
     negatives: Float[Tensor, "S H A"],
     score: Score,
     config: PairsConfig,
+    shown: Float[Tensor, "S G"] | None = None,
 ) -> Pairs:
     """Positives out of the candidates. choose = random is the paper's ablation: K plain samples, neither filtered nor
-    ranked."""
+    ranked. `shown` is what `score` takes for each state, where that is not the policy's features."""
     states, per_state = chunks.shape[:2]
     if config.choose == "random":
         chosen = (torch.arange(per_state, device=chunks.device) < config.positives).expand(states, -1)
         empty = torch.zeros(states, dtype=torch.bool, device=chunks.device)
     else:
         allowed, empty = moderate(distance(chunks, negatives, config.arm_only), config)
-        scores = score(features.repeat_interleave(per_state, dim=0), chunks.flatten(0, 1)).reshape(states, per_state)
+        states_shown = (features if shown is None else shown).repeat_interleave(per_state, dim=0)
+        scores = score(states_shown, chunks.flatten(0, 1)).reshape(states, per_state)
         chosen = top_k(scores, allowed, config.positives)
     kept = chosen.any(dim=1)
     owner = (kept.cumsum(0) - 1).repeat_interleave(chosen.sum(dim=1))

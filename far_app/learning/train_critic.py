@@ -1,7 +1,8 @@
-"""IQL on the policy's frozen features: V and Q from demonstrations, and from the policy's own attempts where given.
+"""IQL: V and Q from demonstrations, and from the policy's own attempts where given.
 
-Features are computed once; an iteration is then a few small matrix products. Batches are keyed by (seed, iteration),
-so a run killed at any moment goes on from its last saved state and ends with the very same weights (on CPU).
+By default on the policy's frozen features, computed once: an iteration is then a few small matrix products. Batches
+are keyed by (seed, iteration), so a run killed at any moment goes on from its last saved state and ends with the very
+same weights (on CPU).
 """
 
 from __future__ import annotations
@@ -13,23 +14,30 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from far_app.errors import ConfigError, PolicyError
-from far_app.learning.critic import Critic, CriticShape, iql_losses
+from far_app.learning.attribution import value_change
+from far_app.learning.critic import Critic, CriticShape, eyes_of, iql_losses
 from far_app.learning.critic_file import encoder_fingerprint, save_critic
+from far_app.learning.critic_source import Features, Pictures, Source, encoded, policy_features
 from far_app.learning.dataset import Episode
 from far_app.learning.policy import DiffusionPolicy
+from far_app.learning.preference import Demonstrations
 from far_app.learning.resume import load_state, optimizer_tensors, restore_optimizer, save_state
-from far_app.learning.train_policy import segment_features
-from far_app.learning.transitions import EncodedEpisode, RewardKind, Transitions, joined, transitions
+from far_app.learning.transitions import RewardKind
 from far_app.seeding import generator
 
 log = logging.getLogger(__name__)
+
+PROBE = 2048
+"""Transitions, spread over all, on which V and Q are reported."""
+KEPT_CHUNKS = 512
+"""Demonstration chunks kept beside a critic for the bc guard."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +55,9 @@ class CriticTraining:
     polyak: float = 0.005
     """ρ of the target networks."""
     reward: RewardKind = "shaped"
+    encoder: Literal["shared", "own"] = "shared"
+    """See through the policy's frozen encoder (features computed once), or through an own one that begins as its copy
+    and is trained too (the paper's form; far slower)."""
     hidden: tuple[int, ...] = (256, 256)
     seed: int = 0
     log_every: int = 500
@@ -59,61 +70,27 @@ class CriticTraining:
             raise ConfigError(f"gamma is {self.gamma}, must be in [0, 1]")
 
 
-def encoded(policy: DiffusionPolicy, episode: Episode, ticks_at_once: int = 64) -> EncodedEpisode:
-    """An episode of N observed ticks as N − 1 transitions: a reward and a success belong to the action before them."""
-    n_obs, ticks = policy.config.n_obs, len(episode)
-    parts = []
-    for start in range(0, ticks, ticks_at_once):
-        end = min(start + ticks_at_once, ticks)
-        frames = np.clip(np.arange(start - n_obs + 1, end), 0, None)
-        images = {c: torch.from_numpy(episode.images[c][frames])[None] for c in policy.config.cameras}
-        with torch.no_grad():
-            parts.append(segment_features(policy, images, torch.from_numpy(episode.states[frames])[None]).numpy())
-    return EncodedEpisode(
-        features=np.concatenate(parts), actions=episode.actions[:-1], rewards=episode.rewards[1:],
-        success=episode.successes[1:],
-    )  # fmt: skip
-
-
-def dataset(
-    policy: DiffusionPolicy, demonstrations: Sequence[Episode], attempts: Sequence[Episode], reward: RewardKind
-) -> Transitions:
-    """D_exp ∪ D_succ ∪ D_fail as transitions."""
-    if not demonstrations:
-        raise ConfigError("no demonstrations to train a critic on; make some with `far demo`")
-    episodes = tqdm([*demonstrations, *attempts], unit="episode", desc="features", leave=False)
-    return joined([transitions(encoded(policy, e), policy.config.horizon, reward) for e in episodes if len(e) > 1])
-
-
-def fit(critic: Critic, data: Transitions, training: CriticTraining, folder: Path, stamp: str = "") -> dict[str, float]:
+def fit(critic: Critic, source: Source, training: CriticTraining, folder: Path, stamp: str = "") -> dict[str, float]:
     """Train (or go on training) on transitions; returns the last interval's means. `stamp` names what the features
     were made with: a saved state with another is refused."""
-    if not len(data):
-        raise ConfigError("no transitions to train a critic on")
-    tensors = [torch.from_numpy(np.ascontiguousarray(a)) for a in (
-        data.features, data.chunks, data.rewards, data.next_features, data.done
-    )]  # fmt: skip
     optimizer = torch.optim.AdamW(
         [p for p in critic.parameters() if p.requires_grad], lr=training.lr, weight_decay=0.0, foreach=True
     )
     state_path = folder / "critic_state.safetensors"
     notes: dict[str, object] = {
-        "training": json.loads(json.dumps(dataclasses.asdict(training))),
-        "stamp": stamp,
-        "size": len(data),
-    }
+        "training": json.loads(json.dumps(dataclasses.asdict(training))), "stamp": stamp, "size": len(source),
+    }  # fmt: skip
     done = resume(critic, optimizer, state_path, notes)
+    probe = np.arange(0, len(source), max(1, len(source) // PROBE))
     if not done:
-        critic.standardise(tensors[0])
+        with torch.no_grad():
+            critic.standardise(source.batch(critic, probe)[0])
     folder.mkdir(parents=True, exist_ok=True)
     started, means, interval = time.monotonic(), {}, []
     bar = tqdm(range(done, training.iterations), initial=done, total=training.iterations, unit="it", desc="critic")
     for iteration in bar:
-        rows = torch.from_numpy(generator("critic", training.seed, iteration).integers(len(data), size=training.batch))
-        features, chunks, rewards, next_features, done_mask = (t[rows] for t in tensors)
-        value_loss, q_loss = iql_losses(
-            critic, features, chunks, rewards, next_features, done_mask, training.expectile, training.gamma
-        )
+        rows = generator("critic", training.seed, iteration).integers(len(source), size=training.batch)
+        value_loss, q_loss = iql_losses(critic, *source.batch(critic, rows), training.expectile, training.gamma)
         optimizer.zero_grad(set_to_none=True)
         (value_loss + q_loss).backward()
         optimizer.step()
@@ -128,7 +105,7 @@ def fit(critic: Critic, data: Transitions, training: CriticTraining, folder: Pat
                     f"the critic's loss became {v} (V), {q} (Q) by iteration {iteration + 1}; the last good state is "
                     f"{state_path}; lower --lr and start again"
                 )
-            means = {"value_loss": v, "q_loss": q} | statistics(critic, tensors[0], tensors[1])
+            means = {"value_loss": v, "q_loss": q} | statistics(critic, source, probe)
             bar.set_postfix(V=f"{v:.4g}", Q=f"{q:.4g}")
             line = {"iteration": iteration + 1, "seconds": time.monotonic() - started} | means
             with (folder / "critic_log.jsonl").open("a") as file:
@@ -156,10 +133,10 @@ def resume(critic: Critic, optimizer: torch.optim.Optimizer, path: Path, notes: 
 
 
 @torch.no_grad()
-def statistics(critic: Critic, features: Tensor, chunks: Tensor) -> dict[str, float]:
+def statistics(critic: Critic, source: Source, rows: np.ndarray) -> dict[str, float]:
     """Where V and Q stand on a spread of the training states."""
-    rows = slice(None, None, max(1, len(features) // 2048))
-    values, q = critic.value(features[rows]), critic.q(features[rows], chunks[rows])
+    features, chunks, *_ = source.batch(critic, rows)
+    values, q = critic.value(features), critic.q(features, chunks)
     return {"value_mean": float(values.mean()), "value_std": float(values.std()), "q_mean": float(q.mean())}
 
 
@@ -174,18 +151,33 @@ def train_critic(
     """Train (or go on training) a critic for this policy in a folder; returns the checkpoint. `attempts` are the
     policy's own rollouts, failed and successful: trained on successes alone, V knows little of failure."""
     torch.manual_seed(training.seed)
-    c = policy.config
-    critic = Critic(CriticShape(
-        features=policy.feature_dim, horizon=c.horizon, action_dim=demonstrations[0].actions.shape[1],
-        hidden=training.hidden,
-    ))  # fmt: skip
     started = time.monotonic()
-    data = dataset(policy, demonstrations, attempts, training.reward)
-    means = fit(critic, data, training, folder, stamp=encoder_fingerprint(policy))
+    data, shown = policy_features(policy, demonstrations, attempts, training.reward)
+    own = training.encoder == "own"
+    shape = CriticShape(
+        features=policy.feature_dim, horizon=policy.config.horizon, action_dim=data.chunks.shape[2],
+        hidden=training.hidden, own_eyes=own,
+    )  # fmt: skip
+    critic = Critic(shape, eyes_of(policy).requires_grad_(True) if own else None)
+    source = Pictures([*demonstrations, *attempts], shape.horizon, training.reward) if own else Features(data)
+    means = fit(critic, source, training, folder, stamp=encoder_fingerprint(policy))
+    kept = generator("demonstration chunks", training.seed).permutation(shown)[:KEPT_CHUNKS]
+    expert = Demonstrations(features=torch.from_numpy(data.features[kept]), chunks=torch.from_numpy(data.chunks[kept]))
     checkpoint = folder / "critic.safetensors"
     save_critic(critic, policy, checkpoint, (card or {}) | {
         "training": dataclasses.asdict(training), "demonstrations": len(demonstrations),
         "attempts": len(attempts), "failed_attempts": sum(not e.success for e in attempts),
         "transitions": len(data), "seconds": time.monotonic() - started, "final": means,
-    })  # fmt: skip
+        "demonstration_value_change_percentiles": value_change_percentiles(critic, policy, demonstrations),
+    }, expert)  # fmt: skip
     return checkpoint
+
+
+@torch.no_grad()
+def value_change_percentiles(
+    critic: Critic, policy: DiffusionPolicy, demonstrations: Sequence[Episode]
+) -> dict[str, float]:
+    """ΔV on the demonstrations, by percentile: what to choose attribution.threshold from."""
+    seen = [torch.from_numpy(encoded(critic.eyes or policy, e).features) for e in demonstrations]
+    changes = np.concatenate([value_change(critic.value(f).numpy(), policy.config.horizon) for f in seen])
+    return {f"{p:g}": float(np.percentile(changes, p)) for p in (1, 5, 10, 25, 50)} if len(changes) else {}

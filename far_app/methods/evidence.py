@@ -25,16 +25,26 @@ def history(attempt: Attempt, tick: int, n_obs: int) -> History:
     return tuple(seen[max(0, tick - back)] for back in reversed(range(n_obs)))
 
 
+def seen(
+    policy: DiffusionPolicy, critic: Critic, attempt: Attempt, ticks: Sequence[int], cancelled: Cancelled
+) -> tuple[Float[Tensor, "S F"], Float[Tensor, "S F"]]:
+    """Of s_t for these ticks: the policy's features, and what the critic takes."""
+    own = features(policy, attempt, ticks, cancelled)
+    if critic.eyes is None:
+        return own, own
+    return own, features(critic.eyes, attempt, ticks, cancelled)
+
+
 def features(
     policy: DiffusionPolicy, attempt: Attempt, ticks: Sequence[int], cancelled: Cancelled
 ) -> Float[Tensor, "S F"]:
     """Encoder features of s_t for these ticks."""
-    parts = []
+    parts = [torch.zeros(0, policy.feature_dim, device=next(policy.parameters()).device)]
     for first in range(0, len(ticks), HISTORIES_A_PASS):
         check(cancelled)
         some = ticks[first : first + HISTORIES_A_PASS]
         parts.append(policy.encode([history(attempt, t, policy.config.n_obs) for t in some]))
-    return torch.cat(parts) if parts else torch.zeros(0, policy.feature_dim, device=policy.normalizer.low.device)
+    return torch.cat(parts)
 
 
 def recorded_values(attempt: Attempt) -> Float[np.ndarray, "T+1"]:
@@ -47,7 +57,8 @@ def values(policy: DiffusionPolicy, critic: Critic, attempt: Attempt, cancelled:
     found = recorded_values(attempt)
     missing = np.flatnonzero(~np.isfinite(found))
     with torch.no_grad():
-        found[missing] = critic.value(features(policy, attempt, missing.tolist(), cancelled)).cpu().numpy()
+        shown = features(critic.eyes or policy, attempt, missing.tolist(), cancelled)
+        found[missing] = critic.value(shown).cpu().numpy()
     return found
 
 

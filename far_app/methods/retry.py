@@ -28,7 +28,8 @@ from far_app.learning.pairs import Pairs, candidates, merged, select, weighted_t
 from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.preference import Demonstrations, Noising
 from far_app.learning.trainable import trainable
-from far_app.methods.evidence import features, recorded_values, sent_chunks, values
+from far_app.methods import evidence
+from far_app.methods.evidence import recorded_values, sent_chunks, values
 from far_app.perturbation import Perturbation, perturbation
 from far_app.protocols import Policy
 from far_app.seeding import generator
@@ -179,7 +180,7 @@ class _Learning:
         """Candidates under the policy that acted, filtered and ranked, for every flagged chunk."""
         method, config = self.method, self.method.config.pairs
         spec = method.policy.spec
-        seen = features(method.base, self.attempt, ticks, self.cancelled)
+        seen, shown = evidence.seen(method.base, critic, self.attempt, ticks, self.cancelled)
         negatives = torch.from_numpy(sent_chunks(self.attempt, ticks, spec.horizon)).to(seen.device)
         shape = (config.candidates, spec.horizon, spec.action_dim)
         noise = [self._rng("candidates", t).standard_normal(shape, dtype=np.float32) for t in ticks]
@@ -200,16 +201,16 @@ class _Learning:
             if not bool(torch.isfinite(chunks).all()):
                 raise FarError(f"the policy {method.policy.version} sampled a non-finite candidate; nothing was learnt")
             self.note("candidates")
-            return select(chunks, seen, negatives, critic.q, config)
+            return select(chunks, seen, negatives, critic.q, config, shown)
 
     def _trajectory(self, critic: Critic) -> Pairs:
         """Every whole chunk of the attempt, weighted by its advantage (the awr objective)."""
         horizon = self.method.policy.spec.horizon
         ticks = range(len(self.attempt.steps) - horizon + 1)
-        seen = features(self.method.base, self.attempt, ticks, self.cancelled)
+        seen, shown = evidence.seen(self.method.base, critic, self.attempt, ticks, self.cancelled)
         chunks = torch.from_numpy(sent_chunks(self.attempt, ticks, horizon)).to(seen.device)
         with torch.no_grad():
-            return weighted_trajectory(seen, chunks, critic.q(seen, chunks) - critic.value(seen))
+            return weighted_trajectory(seen, chunks, critic.q(shown, chunks) - critic.value(shown))
 
     def _rng(self, purpose: str, *key: int) -> np.random.Generator:
         return generator(purpose, self.attempt.scene_seed, self.attempt.index, *key)

@@ -7,12 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from far_app.errors import CheckpointError, ConfigError
-from far_app.learning.critic import Critic, CriticShape, expectile_loss, iql_losses
-from far_app.learning.critic_file import load_critic, save_critic
+from far_app.learning.critic import Critic, CriticShape, expectile_loss, eyes_of, iql_losses
+from far_app.learning.critic_file import load_critic, load_demonstrations, read_card, save_critic
+from far_app.learning.critic_source import Features, Pictures, encoded
 from far_app.learning.dataset import Episode
-from far_app.learning.train_critic import CriticTraining, encoded, fit, train_critic
-from far_app.learning.transitions import EncodedEpisode, Transitions, chunked, labelled, transitions
-from tests.learning.small import SIZE, small_policy
+from far_app.learning.train_critic import CriticTraining, fit, train_critic
+from far_app.learning.transitions import EncodedEpisode, Transitions, chunked, joined, labelled, transitions
+from tests.learning.small import SIZE, small_attempt, small_policy
 
 SHAPE = CriticShape(features=3, horizon=2, action_dim=2, hidden=(32,))
 
@@ -127,7 +128,7 @@ def corridor(cells: int = 6, repeats: int = 40) -> Transitions:
 def test_training_finds_the_value_of_a_corridor(tmp_path):
     critic = Critic(CriticShape(features=7, horizon=2, action_dim=2, hidden=(64,)))
     training = CriticTraining(iterations=2500, lr=2e-3, gamma=0.9, polyak=0.05, expectile=0.7)
-    fit(critic, corridor(), training, tmp_path)
+    fit(critic, Features(corridor()), training, tmp_path)
     with torch.no_grad():
         found = critic.value(torch.eye(7)[:6])
     expected = [-(1 - 0.9**n) / 0.1 for n in (5, 4, 3, 2, 1, 0)]
@@ -141,7 +142,7 @@ def test_a_run_that_was_cut_goes_on_to_the_very_same_weights(tmp_path):
 
     whole, cut, resumed = critic(), critic(), critic()
     training = CriticTraining(iterations=60, save_every=20, log_every=10)
-    fit(whole, corridor(), training, tmp_path / "whole")
+    fit(whole, Features(corridor()), training, tmp_path / "whole")
 
     class Killed(Exception):
         pass
@@ -160,19 +161,19 @@ def test_a_run_that_was_cut_goes_on_to_the_very_same_weights(tmp_path):
 
     cut.follow = die_at_45()
     with pytest.raises(Killed):
-        fit(cut, corridor(), training, tmp_path / "cut")
-    fit(resumed, corridor(), training, tmp_path / "cut")
+        fit(cut, Features(corridor()), training, tmp_path / "cut")
+    fit(resumed, Features(corridor()), training, tmp_path / "cut")
     for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(a, b)
 
 
 def test_a_folder_of_another_run_is_refused(tmp_path):
     critic = Critic(CriticShape(features=7, horizon=2, action_dim=2, hidden=(16,)))
-    fit(critic, corridor(), CriticTraining(iterations=2), tmp_path)
+    fit(critic, Features(corridor()), CriticTraining(iterations=2), tmp_path)
     with pytest.raises(ConfigError, match="another training"):
-        fit(critic, corridor(), CriticTraining(iterations=2, gamma=0.5), tmp_path)
+        fit(critic, Features(corridor()), CriticTraining(iterations=2, gamma=0.5), tmp_path)
     with pytest.raises(ConfigError, match="another stamp"):
-        fit(critic, corridor(), CriticTraining(iterations=2), tmp_path, stamp="other encoder")
+        fit(critic, Features(corridor()), CriticTraining(iterations=2), tmp_path, stamp="other encoder")
 
 
 def episode(ticks: int, success: bool, seed: int = 0) -> Episode:
@@ -208,8 +209,46 @@ def test_a_trained_critic_loads_for_its_policy_and_for_no_other(tmp_path):
     critic = load_critic(path, policy)
     assert critic.shape.features == policy.feature_dim
     assert bool(torch.isfinite(critic.value(torch.zeros(2, policy.feature_dim))).all())
+    percentiles = read_card(path)["demonstration_value_change_percentiles"]
+    assert percentiles["1"] <= percentiles["50"]
     with pytest.raises(CheckpointError, match="its values would mean nothing"):
         load_critic(path, small_policy(seed=9))
+
+
+def test_demonstration_chunks_lie_beside_the_critic(tmp_path):
+    """Only demonstrations, not attempts; features are the policy's."""
+    policy, demonstration = small_policy(), episode(12, True)
+    path = train_critic(
+        [demonstration], [episode(15, False, seed=1)], policy, CriticTraining(iterations=2, hidden=(8,)), tmp_path
+    )
+    kept = load_demonstrations(path, policy)
+    features = torch.from_numpy(encoded(policy, demonstration).features[:-1])
+    assert len(kept.chunks) == 11
+    assert torch.allclose(torch.cdist(kept.features, features).min(1).values, torch.zeros(11), atol=1e-3)
+
+
+def test_pictures_are_the_same_transitions_as_features():
+    """Before any training an own encoder is the policy's: both sources give the same batch."""
+    policy, episodes = small_policy(), [episode(9, True), episode(7, False, seed=1)]
+    critic = Critic(CriticShape(features=policy.feature_dim, horizon=8, action_dim=7, own_eyes=True), eyes_of(policy))
+    features = Features(joined([transitions(encoded(policy, e), 8, "shaped") for e in episodes]))
+    pictures = Pictures(episodes, 8, "shaped")
+    assert len(pictures) == len(features) == 14
+    rows = np.array([0, 7, 8, 13, 3])
+    for one, other in zip(features.batch(critic, rows), pictures.batch(critic, rows), strict=True):
+        assert torch.allclose(one, other, atol=1e-5)
+
+
+def test_an_own_encoder_is_trained_saved_and_used(tmp_path):
+    policy = small_policy()
+    training = CriticTraining(iterations=4, batch=8, lr=1e-2, hidden=(8,), encoder="own")
+    path = train_critic([episode(12, True)], [], policy, training, tmp_path)
+    critic = load_critic(path, policy)
+    attempt = small_attempt(ticks=9)
+    histories = [(attempt.steps[0].observation, attempt.steps[1].observation)]
+    features = policy.encode(histories)
+    assert not torch.allclose(critic.see(histories, features), features, atol=1e-4)
+    assert sum(v.numel() for v in critic.state_dict().values()) > sum(p.numel() for p in policy.encoder.parameters())
 
 
 def test_bad_critic_files_say_what_to_do(tmp_path):
