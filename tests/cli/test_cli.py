@@ -117,10 +117,10 @@ def test_a_port_in_use_is_named_before_anything_starts():
 
 
 @pytest.mark.parametrize("words", [
-    ["train", "policy", "--preset", "nope", "--demos", "d.hdf5", "--out", "o"],
-    ["train", "policy", "--task", "fold", "--demos", "d.hdf5", "--out", "o"],
-    ["train", "policy", "--demos", "nowhere.hdf5", "--out", "o"],
-    ["train", "critic", "--policy", "nowhere.safetensors", "--demos", "d.hdf5", "--out", "o"],
+    ["train", "policy", "--preset", "nope", "--out", "o"],
+    ["train", "policy", "--task", "fold", "--out", "o"],
+    ["train", "policy", "--data", "nowhere.hdf5", "--out", "o"],
+    ["train", "critic", "--policy", "nowhere.safetensors", "--out", "o"],
     ["inspect", "nowhere"],
 ], ids=" ".join)  # fmt: skip
 def test_bad_input_of_other_commands_is_one_line_too(words, tmp_path, monkeypatch, capsys):
