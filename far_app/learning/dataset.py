@@ -35,6 +35,8 @@ class Episode:
     """The task's own check at each tick."""
     success: bool
     seed: int
+    objects: Float[np.ndarray, "N K"] | None = None
+    """Position and quaternion of each object, base frame, where the demonstrations know them (the twin's do)."""
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -99,6 +101,7 @@ def read_episodes(path: Path, cameras: tuple[str, ...], limit: int | None = None
                 images={c: group["obs"][f"{c}_image"][:] for c in cameras}, states=states.astype(np.float32),
                 actions=group["actions"][:], rewards=group["rewards"][:], successes=group["dones"][:].astype(bool),
                 success=bool(group.attrs["success"]), seed=int(group.attrs["seed"]),
+                objects=group["obs"]["object"][:] if "object" in group["obs"] else None,
             ))  # fmt: skip
     return episodes
 

@@ -47,6 +47,10 @@ class PolicyTraining:
     lr_end: float = 1e-5
     warmup: int = 100
     weight_decay: float = 1e-6
+    localise: float = 0.0
+    """Weight of an auxiliary loss: a linear head on the features says where the objects are relative to the hand (in
+    10 cm). It makes a small encoder look at what matters; only demonstrations that know object poses have it, and
+    nothing of it is left in the checkpoint."""
     shift: int = 4
     """Largest random shift of the pictures, pixels."""
     ema_power: float = 0.75
@@ -61,8 +65,11 @@ class PolicyTraining:
 
 TRAININGS = {
     "paper": PolicyTraining(),
-    "quickstart": PolicyTraining(iterations=4_000, batch=64, draws=2, lr=5e-4, lr_end=2e-5),
+    "quickstart": PolicyTraining(iterations=4_000, batch=64, draws=2, lr=5e-4, lr_end=2e-5, localise=1.0),
 }
+
+
+Segments = tuple[dict[str, Tensor], Tensor, Tensor, Tensor | None]
 
 
 class DemonstrationArrays:
@@ -80,12 +87,14 @@ class DemonstrationArrays:
         }
         self.states = np.concatenate([e.states for e in episodes])
         self.actions = np.concatenate([e.actions for e in episodes])
+        self.offsets = object_offsets(episodes)
         self.ends = np.repeat(self.starts + self.lengths - 1, self.lengths)
         """Row of the last tick of each row's episode."""
 
-    def segments(self, count: int, length: int, rng: np.random.Generator) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    def segments(self, count: int, length: int, rng: np.random.Generator) -> Segments:
         """`count` segments of `length` ticks: frames (count, length + n_obs − 1, S, S, 3), states, chunks
-        (count, length, H, A). Ticks before an episode's first repeat it, actions past its last repeat it."""
+        (count, length, H, A), object offsets (count, length, K). Ticks before an episode's first repeat it, actions
+        past its last repeat it."""
         n_obs, horizon, size = self.config.n_obs, self.config.horizon, self.config.image_size
         rows = rng.integers(0, len(self.ends), count)
         first = np.searchsorted(self.starts, rows, side="right") - 1
@@ -96,7 +105,8 @@ class DemonstrationArrays:
         images = {c: torch.from_numpy(self._cropped(a, frames, offsets, size)) for c, a in self.images.items()}
         ticks = frames[:, n_obs - 1 :]
         index = np.minimum(ticks[..., None] + np.arange(horizon), self.ends[rows][:, None, None])
-        return images, torch.from_numpy(self.states[frames]), torch.from_numpy(self.actions[index])
+        located = None if self.offsets is None else torch.from_numpy(self.offsets[ticks])
+        return images, torch.from_numpy(self.states[frames]), torch.from_numpy(self.actions[index]), located
 
     @staticmethod
     def _cropped(array: np.ndarray, frames: np.ndarray, offsets: np.ndarray, size: int) -> np.ndarray:
@@ -104,6 +114,16 @@ class DemonstrationArrays:
         for i, (dy, dx) in enumerate(offsets):
             out[i] = array[frames[i], dy : dy + size, dx : dx + size]
         return out
+
+
+def object_offsets(episodes: Sequence[Episode]) -> np.ndarray | None:
+    """Object positions relative to the hand in units of 10 cm, (N, 3 · objects); None where they are not known."""
+    if any(e.objects is None for e in episodes):
+        return None
+    parts = [
+        e.objects.reshape(len(e), -1, 7)[:, :, :3] - e.states[:, None, :3] for e in episodes if e.objects is not None
+    ]
+    return (np.concatenate(parts).reshape(sum(map(len, parts)), -1) * 10.0).astype(np.float32)
 
 
 def segment_features(policy: DiffusionPolicy, images: dict[str, Tensor], states: Tensor) -> Tensor:
@@ -162,7 +182,7 @@ def train_policy(
     card: dict[str, object] | None = None,
     imagenet: dict[str, Tensor] | None = None,
 ) -> Path:
-    """Train (or go on training) in a folder; returns the checkpoint (EMA weights). log.jsonl has one line an interval."""
+    """Train (or go on training) in a folder; returns the checkpoint (EMA weights). log.jsonl: a line an interval."""
     torch.manual_seed(training.seed)
     rng = np.random.default_rng(training.seed)
     generator = torch.Generator().manual_seed(training.seed)
@@ -173,9 +193,11 @@ def train_policy(
     policy.normalizer.fit(arrays.states)
     policy.to(device)
     ema = copy.deepcopy(policy).requires_grad_(False)
-    optimizer = torch.optim.AdamW(
-        policy.parameters(), lr=training.lr, betas=(0.95, 0.999), weight_decay=training.weight_decay
-    )
+    locator = None
+    if training.localise > 0 and arrays.offsets is not None:
+        locator = torch.nn.Linear(policy.feature_dim, arrays.offsets.shape[1]).to(device)
+    learnt = [*policy.parameters(), *(locator.parameters() if locator is not None else ())]
+    optimizer = torch.optim.AdamW(learnt, lr=training.lr, betas=(0.95, 0.999), weight_decay=training.weight_decay)
     denoiser = trainable(policy.denoiser, config.horizon)
     state_path = folder / "state.safetensors"
     done = 0
@@ -184,6 +206,8 @@ def train_policy(
         if notes["training"] != json.loads(json.dumps(dataclasses.asdict(training))):
             raise ConfigError(f"{folder} holds a run with other settings; choose another --out or delete it")
         policy.load_state_dict({k[7:]: v for k, v in tensors.items() if k.startswith("policy.")})
+        if locator is not None:
+            locator.load_state_dict({k[8:]: v for k, v in tensors.items() if k.startswith("locator.")})
         ema.load_state_dict({k[4:]: v for k, v in tensors.items() if k.startswith("ema.")})
         restore_optimizer(optimizer, tensors)
         rng.bit_generator.state = notes["rng"]
@@ -194,6 +218,8 @@ def train_policy(
     def save(iteration: int) -> None:
         tensors = {f"policy.{k}": v for k, v in policy.state_dict().items()}
         tensors |= {f"ema.{k}": v for k, v in ema.state_dict().items()}
+        if locator is not None:
+            tensors |= {f"locator.{k}": v for k, v in locator.state_dict().items()}
         tensors |= optimizer_tensors(optimizer) | {"generator": generator.get_state()}
         save_state(state_path, tensors, {
             "iteration": iteration, "rng": rng.bit_generator.state, "training": dataclasses.asdict(training),
@@ -206,11 +232,14 @@ def train_policy(
         lr = learning_rate(training, iteration)
         for group in optimizer.param_groups:
             group["lr"] = lr
-        images, states, chunks = arrays.segments(training.batch // training.segment, training.segment, rng)
+        images, states, chunks, offsets = arrays.segments(training.batch // training.segment, training.segment, rng)
         images = {c: v.to(device, non_blocking=True) for c, v in images.items()}
         features = segment_features(policy, images, states.to(device))
         denoiser.refresh()
         loss = denoising_loss(denoiser, features, chunks.flatten(0, 1).to(device), generator, training.draws)
+        if locator is not None and offsets is not None:
+            located = (locator(features) - offsets.flatten(0, 1).to(device)).square().mean()
+            loss = loss + training.localise * located
         if not torch.isfinite(loss):
             raise PolicyError(
                 f"the loss became {loss.item()} at iteration {iteration}; the last good state is {state_path}; "
