@@ -22,7 +22,8 @@ def resnet18_weights(path: Path | None) -> dict[str, Tensor]:
     if not file.exists():
         raise CheckpointError(
             f"no ImageNet weights at {file}; convert torchvision's once with: python -c \"import torch, "
-            f"safetensors.torch as s; s.save_file(torch.hub.load_state_dict_from_url('{URL}'), '{NAME}')\" and give --imagenet {NAME}"
+            f"safetensors.torch as s; s.save_file(torch.hub.load_state_dict_from_url('{URL}'), '{NAME}')\" "
+            f"and give --imagenet {NAME}"
         )
     if file.suffix != ".safetensors":
         raise CheckpointError(f"{file} is not a safetensors file; pickled weights are never loaded, convert it first")
