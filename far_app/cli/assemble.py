@@ -46,6 +46,7 @@ def assemble(
 
         return Parts(method=ScriptedMethod(policy.removeprefix("test:")), policy_name=policy, max_attempts=None)
 
+    from far_app.learning.critic_file import load_demonstrations
     from far_app.learning.runtime import ActingPolicy
     from far_app.methods import METHODS, Ingredients
     from far_app.methods import method as make_method
@@ -54,6 +55,7 @@ def assemble(
         raise ConfigError(f"unknown method '{method}'; choose one of: {', '.join(METHODS)}")
     entry = METHODS[method]
     check_device(device)
+    demonstrations = None
     if policy is not None and policy.startswith(UNTRAINED):
         name = policy
         network, critic_network = untrained(policy.removeprefix(UNTRAINED), task.name, device)
@@ -62,10 +64,12 @@ def assemble(
         beside = shipped(task.name, "critic") if policy is None else path.with_name("critic.safetensors")
         name = str(path)
         network, critic_network = trained(path, critic or beside, task.name, device, entry.needs_critic)
+        if retry.fcpa.guard == "bc" and critic_network is not None:
+            demonstrations = load_demonstrations(critic or beside, network)
     made = make_method(
         method,
         Ingredients(
-            network=network, critic=critic_network, config=retry,
+            network=network, critic=critic_network, config=retry, demonstrations=demonstrations,
             act=lambda net, version: ActingPolicy(net, version, critic_network),
         ),
     )  # fmt: skip

@@ -44,9 +44,9 @@ class ActingPolicy:
             condition = self._denoiser.condition(features)
             start = torch.from_numpy(np.ascontiguousarray(noise, np.float32)).to(self.device)
             chunks = ddim_sample(self._denoiser.run, condition, start, self.network.config.ddim_steps).cpu().numpy()
-            values = (
-                self.critic.value(features).cpu().numpy() if self.critic is not None else np.full(len(ticks), np.nan)
-            )
+            values = np.full(len(ticks), np.nan)
+            if self.critic is not None:
+                values = self.critic.value(self.critic.see(histories, features)).cpu().numpy()
         if not np.isfinite(chunks).all():
             raise PolicyError(
                 f"policy {self.spec.name} ({self.version}) planned a non-finite action at tick {ticks[0]}; check its "
