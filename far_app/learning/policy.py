@@ -73,6 +73,10 @@ def proprioception(observation: Observation) -> Float[np.ndarray, "8"]:
 class Normalizer(nn.Module):
     """State to [−1, 1] by the demonstrations' range; quaternions are flipped to the demonstrations' hemisphere."""
 
+    low: Tensor
+    high: Tensor
+    hemisphere: Tensor
+
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("low", torch.full((STATE_DIM,), -1.0))
