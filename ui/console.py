@@ -75,13 +75,12 @@ class Console:
         latest: Callable[[], tuple[Telemetry | None, Freshness]],
         *,
         scene3d: bool,
-        viewer: str | None,
     ) -> None:
         self.pressed: queue.SimpleQueue[Intent] = queue.SimpleQueue()
         """Intents that passed the guard, for the caller to send."""
         self.refusal = ""
         """Why the page itself refused the last press."""
-        self._gui, self._stop, self._latest, self._viewer = server.gui, stop_line, latest, viewer
+        self._gui, self._stop, self._latest = server.gui, stop_line, latest
         self._presses = Presses(server)
         self._refused_at = 0.0
         self._beats = 0
@@ -90,6 +89,7 @@ class Console:
         self._controls: dict[Intent, tuple[_Button, viser.GuiButtonHandle, Any]] = {}
         self._plotted: tuple[object, ...] = ()
         self._length = 151
+        self._nudge = 1.0
         server.gui.configure_theme(dark_mode=True, brand_color=BRAND, show_logo=False, show_share_button=False)
         server.gui.set_panel_label("FAR")
         self.scene = Scene3D(server) if scene3d else None
@@ -114,7 +114,7 @@ class Console:
         self._events = gui.add_html(html.events((), 0.0))
         self._add_cameras()
         self._add_plots()
-        self._foot = gui.add_html(html.foot((), "", self._viewer, ""))
+        self._foot = gui.add_html(html.foot((), "", None, ""))
         gui.add_html(f"<style>{_STYLE}\n@media (min-width: 768px) {{ {' '.join(places)} }}</style>")
 
     def _add_control(self, button: _Button) -> str:
@@ -139,12 +139,20 @@ class Console:
         still: Any = {"show": False}
         clear: Any = {"stroke": _CLEAR, "points": dots, "scale": "flag"}
         frame: Any = {"stroke": _CLEAR, "points": dots}
+        nudge: Any = {"stroke": _CLEAR, "points": dots, "scale": "nudge"}
         # Only `frame` sets the y axis: a series that begins with NaN would make uPlot's range NaN.
         v = value_plot(None)
         self._value_caption = self._gui.add_html(html.value_caption(None))
         self._value = self._gui.add_uplot(
-            (v.tick, v.shade, v.floor, v.value, v.frame),
-            ({"label": "tick"}, clear, clear, {"stroke": _BLUE, "width": 2.5, "points": dots, "auto": False}, frame),
+            (v.tick, v.shade, v.floor, v.value, v.frame, v.floor),
+            (
+                {"label": "tick"},
+                clear,
+                clear,
+                {"stroke": _BLUE, "width": 2.5, "points": dots, "auto": False},
+                frame,
+                nudge,
+            ),
             bands=(uplot.Band(series=(1, 2), fill="rgba(255, 77, 79, 0.38)"),),
             scales=_scales(150) | {"flag": uplot.Scale(range=(0.0, 1.0))},
             axes=axes, legend={"show": False}, cursor=still, aspect=2.6, padding=(8, 20, 0, 0),
@@ -153,7 +161,7 @@ class Console:
         self._change_caption = self._gui.add_html(html.change_caption(None))
         flagged: Any = {"show": True, "size": 8, "fill": _RED, "stroke": _RED}
         self._change = self._gui.add_uplot(
-            (c.tick, c.zero, c.change, c.threshold, c.flagged, c.frame),
+            (c.tick, c.zero, c.change, c.threshold, c.flagged, c.frame, c.zero),
             (
                 {"label": "tick"},
                 {"stroke": "rgb(59, 76, 94)", "width": 1, "points": dots, "auto": False},
@@ -161,6 +169,7 @@ class Console:
                 {"stroke": _RED, "width": 1.5, "dash": (6, 5), "points": dots, "auto": False},
                 {"stroke": _CLEAR, "points": flagged, "auto": False},
                 frame,
+                nudge,
             ),
             scales=_scales(150),
             axes=axes, legend={"show": False}, cursor=still, aspect=2.85, padding=(8, 20, 0, 0),
@@ -196,8 +205,8 @@ class Console:
         self._beats += 1
         self._beat.content = html.beat(self._beats, fresh)
 
-    def text(self, telemetry: Telemetry | None, view: View | None, fresh: Freshness) -> None:
-        """Words, buttons, tables; viser sends only what changed."""
+    def text(self, telemetry: Telemetry | None, view: View | None, fresh: Freshness, viewer: str | None) -> None:
+        """Words, buttons, tables; viser sends only what changed. `viewer` is where rerun shows the session."""
         status = view.status if view is not None and not fresh.hw_silent else None
         self._head.content = html.head(banner(telemetry, fresh), arm_word(status))
         latched = status is not None and status.mode is RobotMode.LATCHED
@@ -215,7 +224,7 @@ class Console:
             self._history.content = html.history(telemetry.history, summary(telemetry.history))
             self._events.content = html.events(telemetry.log, telemetry.stamp)
             refusal = refusal or telemetry.refusal
-        self._foot.content = html.foot(gauges, refusal, self._viewer, session)
+        self._foot.content = html.foot(gauges, refusal, viewer, session)
 
     def pictures(self, view: View) -> None:
         """The cameras' JPEGs as they came: no decoding and no encoding on the way to the browser."""
@@ -226,20 +235,27 @@ class Console:
                 self._pictures[camera] = jpeg
 
     def plots(self, telemetry: Telemetry) -> None:
+        """Sent when something changed, and every two seconds.
+
+        uplot-react forgets to lay out the axes when new data comes in the very render in which a chart learns its
+        width, and stays so until some scale changes: an invisible series on a scale of its own makes one change."""
         t = telemetry
         last = float(t.values[-1]) if len(t.values) else 0.0
-        key = (t.trial, t.attempt, len(t.values), last, len(t.value_changes), t.flagged, t.horizon)
+        beat = int(time.monotonic() / 2)
+        key = (t.trial, t.attempt, len(t.values), last, len(t.value_changes), t.flagged, t.horizon, beat)
         if key == self._plotted:
             return
         self._plotted = key
         v, c = value_plot(t), change_plot(t)
+        self._nudge = 3.0 - self._nudge
         if len(v.tick) != self._length:
             self._length = len(v.tick)
             self._value.scales = _scales(self._length - 1) | {"flag": uplot.Scale(range=(0.0, 1.0))}
             self._change.scales = _scales(self._length - 1)
         self._value_caption.content, self._change_caption.content = html.value_caption(t), html.change_caption(t)
-        self._value.data = (v.tick, v.shade, v.floor, v.value, v.frame)
-        self._change.data = (c.tick, c.zero, c.change, c.threshold, c.flagged, c.frame)
+        nudge = np.linspace(0, self._nudge, len(v.tick))
+        self._value.data = (v.tick, v.shade, v.floor, v.value, v.frame, nudge)
+        self._change.data = (c.tick, c.zero, c.change, c.threshold, c.flagged, c.frame, nudge)
 
 
 def _place(handle: viser.GuiButtonHandle, box: tuple[float, float, float, float]) -> str:
@@ -251,12 +267,14 @@ def _place(handle: viser.GuiButtonHandle, box: tuple[float, float, float, float]
 
 
 def _big(handle: viser.GuiButtonHandle) -> str:
-    """STOP: large, white on red, above even the dead-man overlay."""
+    """STOP: large, white on red; above the overlay of a silent app, below that of a lost page, where it is dead."""
     button = f'button[id="{handle._impl.uuid}"].mantine-Button-root'
+    lost = 'div[style*="pointer-events: none"] > div'
     return (
         f"{button} {{ color: #fff !important; }} "
         f"{button} .mantine-Button-label::first-line {{ font-size: calc(4.6 * var(--u)); font-weight: 800; "
-        f"letter-spacing: .04em; }} div:has(> {button}) {{ z-index: 70 !important; }}"
+        f"letter-spacing: .04em; }} div:has(> {button}) {{ z-index: 70 !important; }} "
+        f"{lost} > div:has(> {button}) {{ z-index: 20 !important; }}"
     )
 
 

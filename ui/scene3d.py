@@ -9,7 +9,7 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from far_app.telemetry import SceneGeometry, Telemetry
+from far_app.telemetry import BodyMesh, SceneGeometry, Telemetry
 from ui.plot_model import flagged_ticks
 
 BRAND = (63, 184, 255)
@@ -33,9 +33,9 @@ class Scene3D:
         self._path: viser.LineSegmentsHandle | None = None
         self._trail_line: viser.LineSegmentsHandle | None = None
         self._trail_key: tuple[object, ...] = ()
-        server.initial_camera.position = (1.25, -0.95, 0.75)
-        server.initial_camera.look_at = (0.38, 0.0, 0.16)
-        server.initial_camera.fov = 0.7
+        server.initial_camera.position = (1.22, -0.82, 0.68)
+        server.initial_camera.look_at = (0.3, 0.03, 0.2)
+        server.initial_camera.fov = 0.66
         self._scene.configure_default_lights(enabled=True, cast_shadow=False)
 
     def build(self, geometry: SceneGeometry) -> None:
@@ -47,7 +47,8 @@ class Scene3D:
         for index, mesh in enumerate(geometry.meshes):
             if mesh.body not in self._frames:
                 self._frames[mesh.body] = self._scene.add_frame(f"/twin/{mesh.body}", show_axes=False)
-            r, g, b, a = mesh.rgba
+            r, g, b = _tinted(mesh)
+            a = mesh.rgba[3]
             self._scene.add_mesh_simple(
                 f"/twin/{mesh.body}/{index}",
                 vertices=np.asarray(mesh.vertices, dtype=np.float32),
@@ -56,6 +57,7 @@ class Scene3D:
                 opacity=None if a >= 1 else float(a),
                 cast_shadow=False,
                 receive_shadow=False,
+                flat_shading=len(mesh.vertices) <= 8,
                 side="double",
             )
 
@@ -87,7 +89,7 @@ class Scene3D:
         color = FLAGGED if telemetry.tick in telemetry.flagged else BRAND
         colors = np.broadcast_to(np.array(color, np.uint8), segments.shape).copy()
         if self._path is None or self._path.points.shape != segments.shape:
-            self._path = self._scene.add_line_segments("/chunk", segments, colors, thickness=0.006)
+            self._path = self._scene.add_line_segments("/chunk", segments, colors, thickness=0.01)
         else:
             self._path.points, self._path.colors, self._path.visible = segments, colors, True
 
@@ -118,4 +120,11 @@ class Scene3D:
         red = np.array([covered[tick] for tick, _ in self._trail[1:]])
         colors = np.where(red[:, None, None], np.array(FLAGGED, np.uint8), np.array(TRAIL, np.uint8))
         colors = np.broadcast_to(colors, segments.shape).astype(np.uint8)
-        self._trail_line = self._scene.add_line_segments("/trail", segments, colors, thickness=0.004)
+        self._trail_line = self._scene.add_line_segments("/trail", segments, colors, thickness=0.005)
+
+
+def _tinted(mesh: BodyMesh) -> tuple[float, float, float]:
+    """A mesh's colour under the page's lights; furniture (over half a metre) dimmed so that the arm stands out."""
+    r, g, b, _ = mesh.rgba
+    large = float(np.ptp(mesh.vertices, axis=0).max()) > 0.5
+    return (0.22 * r, 0.25 * g, 0.29 * b) if large else (0.78 * r, 0.78 * g, 0.78 * b)

@@ -7,10 +7,8 @@ STOP (its own line) and viser's event loop. Exits 0 on SIGTERM or SIGINT, and wh
 from __future__ import annotations
 
 import argparse
-import ctypes
 import gc
 import logging
-import os
 import signal
 import sys
 import threading
@@ -25,7 +23,9 @@ from far_app.session_states import Intent
 from far_app.telemetry import Telemetry
 from ui.console import Console
 from ui.feeds import Feeds
+from ui.live_viewer import LiveViewer
 from ui.page_server import open_page, page_url
+from ui.parent import die_with_parent
 from ui.stop import StopLine
 from ui.view_model import Freshness
 
@@ -33,7 +33,6 @@ log = logging.getLogger(__name__)
 
 TICK = 1 / 15
 """Seconds between two looks at the sockets; poses are pushed at this rate."""
-PR_SET_PDEATHSIG = 1
 
 
 @dataclass
@@ -58,8 +57,10 @@ class PageOptions:
     port: int = 8080
     scene3d: bool = True
     operator: str = "operator"
-    viewer: str | None = None
-    """Address of the rerun viewer, linked from the page; None for no link."""
+    rerun: bool = True
+    """Show the session live in rerun too, in a process of its own."""
+    recordings: Path = Path("recordings")
+    """Where the sessions lie whose closed attempts rerun shows."""
 
 
 class Page:
@@ -72,9 +73,8 @@ class Page:
         self.port = self._server.get_port()
         self._feeds = Feeds(endpoints)
         self._stop_line = StopLine(endpoints.stop)
-        self._console = Console(
-            self._server, self._stop_line, self._latest, scene3d=options.scene3d, viewer=options.viewer
-        )
+        self._console = Console(self._server, self._stop_line, self._latest, scene3d=options.scene3d)
+        self._viewer = LiveViewer(options.run_folder, options.recordings) if options.rerun else None
         self._pictures, self._plots, self._texts, self._beats = Every(1 / 12), Every(1 / 5), Every(1 / 5), Every(1 / 2)
         self._hw_seq = 0
 
@@ -95,7 +95,8 @@ class Page:
             if self._beats(now) and not (telemetry is not None and fresh.app is None):
                 self._console.beat(fresh)
             if self._texts(now):
-                self._console.text(telemetry, self._feeds.view.message, fresh)
+                viewer = self._viewer.url if self._viewer is not None else None
+                self._console.text(telemetry, self._feeds.view.message, fresh, viewer)
             if telemetry is not None and heard:
                 if self._plots(now):
                     self._console.plots(telemetry)
@@ -127,6 +128,8 @@ class Page:
                 log.warning("nobody takes the intent %s: is the app running?", intent.value)
 
     def close(self) -> None:
+        if self._viewer is not None:
+            self._viewer.close()
         self._stop_line.close()
         self._feeds.close()
         self._server.stop()
@@ -134,24 +137,18 @@ class Page:
 
 def serve(options: PageOptions, ended: threading.Event) -> None:
     """Run the page until `ended` is set or our parent is gone."""
-    parent = os.getppid()
+    orphaned = die_with_parent()
     page = Page(options)
     log.info("the operator page is at %s", page_url(options.host, page.port))
     gc.freeze()
     try:
         due = time.monotonic()
-        while not ended.is_set() and os.getppid() == parent:
+        while not ended.is_set() and not orphaned():
             page.tick()
             due = max(due + TICK, time.monotonic())
             ended.wait(due - time.monotonic())
     finally:
         page.close()
-
-
-def die_with_parent() -> None:
-    """Linux: SIGTERM to us when our parent dies, even by SIGKILL."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def parse(arguments: Sequence[str] | None) -> PageOptions:
@@ -160,7 +157,8 @@ def parse(arguments: Sequence[str] | None) -> PageOptions:
     parser.add_argument("--host", default="127.0.0.1", help="loopback address to bind")
     parser.add_argument("--port", type=int, default=8080, help="0 lets the system choose")
     parser.add_argument("--operator", default="operator", help="name stored with every intent")
-    parser.add_argument("--viewer", default=None, help="address of the rerun viewer to link to")
+    parser.add_argument("--recordings", type=Path, default=Path("recordings"), help="folder of the sessions")
+    parser.add_argument("--no-rerun", dest="rerun", action="store_false", help="no live rerun viewer")
     parser.add_argument("--no-scene3d", dest="scene3d", action="store_false", help="leave out the twin's meshes")
     return PageOptions(**vars(parser.parse_args(arguments)))
 
@@ -171,7 +169,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
-    die_with_parent()
     try:
         serve(options, ended)
     except FarError as error:

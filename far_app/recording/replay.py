@@ -103,7 +103,7 @@ def open_viewer(
     if web:
         _check_port(port)
     data_port = _free_port()
-    with _quiet_configuration() as environment, _interrupted_by_sigterm():
+    with quiet_configuration() as environment, _interrupted_by_sigterm():
         viewer = subprocess.Popen(viewer_command(rrds, data_port, web_port=port if web else None), env=environment)
         try:
             if web:
@@ -173,7 +173,7 @@ def _check_port(port: int) -> None:
 
 
 @contextmanager
-def _quiet_configuration() -> Iterator[dict[str, str]]:
+def quiet_configuration() -> Iterator[dict[str, str]]:
     """An environment in which the viewer sends no usage data; the user's own settings stay as they are."""
     with tempfile.TemporaryDirectory(prefix="far_viewer_") as folder:
         environment = {**os.environ, "XDG_CONFIG_HOME": folder}

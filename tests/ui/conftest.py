@@ -19,7 +19,8 @@ class PageProcess:
 
     def __init__(self, folder: Path, port: int, *arguments: str) -> None:
         self.url = f"http://127.0.0.1:{port}"
-        command = [sys.executable, "-m", "ui.server", "--run-folder", str(folder), "--port", str(port), *arguments]
+        command = [sys.executable, "-m", "ui.server", "--run-folder", str(folder), "--port", str(port)]
+        command += ["--no-scene3d", "--no-rerun", *arguments]
         self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         deadline = time.monotonic() + 30
         while time.monotonic() < deadline and self.process.poll() is None:

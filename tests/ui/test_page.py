@@ -43,7 +43,7 @@ def browser() -> Iterator[Any]:
 @pytest.fixture
 def tab(browser: Any, start_page: Start, stage: Stage) -> Iterator[Any]:
     """An open page that shows the test source's running attempt; requests that leave the machine are recorded."""
-    process = start_page("--no-scene3d")
+    process = start_page()
     page = browser.new_page(viewport={"width": 1280, "height": 720})
     page.requests = []
     page.on("request", lambda request: page.requests.append(request.url))
@@ -131,7 +131,7 @@ def test_after_a_stop_resume_takes_a_click_not_a_stray_key(tab: Any, stage: Stag
 def test_the_overlay_rises_when_the_ui_process_dies_and_falls_when_it_returns(
     browser: Any, stage: Stage, start_page: Start
 ) -> None:
-    process = start_page("--no-scene3d")
+    process = start_page()
     page = browser.new_page(viewport={"width": 1280, "height": 720})
     page.goto(process.url)
     page.wait_for_selector("#op-state[data-state='RUNNING']", timeout=30_000)
@@ -142,7 +142,7 @@ def test_the_overlay_rises_when_the_ui_process_dies_and_falls_when_it_returns(
     page.wait_for_function(f"() => {opacity} === '1'")
     assert "NO LIVE DATA" in page.inner_text("#op-dead")
     stage.telemetry = running(5, 4)
-    start_page("--no-scene3d")
+    start_page()
     page.wait_for_selector("#op-state[data-attempt='4']", timeout=30_000)
     page.wait_for_function(f"() => {opacity} === '0'")
     page.close()

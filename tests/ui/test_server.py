@@ -52,7 +52,7 @@ def test_only_loopback_is_served(host: str) -> None:
 
 
 def test_foreign_origins_are_refused_and_our_own_are_not(start_page: Start, stage: Stage) -> None:
-    page = start_page("--no-scene3d")
+    page = start_page()
     own = page.url.rsplit(":", 1)[1]
     for origin in ("http://evil.example", f"http://evil.example:{own}", "http://127.0.0.1:1", "null"):
         with pytest.raises(InvalidStatus):
@@ -62,7 +62,7 @@ def test_foreign_origins_are_refused_and_our_own_are_not(start_page: Start, stag
 
 
 def test_stop_reaches_the_hw_server_though_the_app_is_silent(start_page: Start, stage: Stage) -> None:
-    client = connected(start_page("--no-scene3d"))
+    client = connected(start_page())
     stage.telemetry = None
     stop = client.find("STOP")
     assert stop is not None
@@ -73,7 +73,7 @@ def test_stop_reaches_the_hw_server_though_the_app_is_silent(start_page: Start, 
 
 
 def test_an_unanswered_stop_is_said_to_be_unconfirmed(start_page: Start, stage: Stage) -> None:
-    client = connected(start_page("--no-scene3d"))
+    client = connected(start_page())
     stage.close()
     stop = client.find("STOP")
     assert stop is not None
@@ -82,7 +82,7 @@ def test_an_unanswered_stop_is_said_to_be_unconfirmed(start_page: Start, stage: 
 
 
 def test_an_allowed_press_reaches_the_app_and_a_disabled_one_is_refused(start_page: Start, stage: Stage) -> None:
-    client = connected(start_page("--no-scene3d"))
+    client = connected(start_page())
     resume, pause = client.find("Resume"), client.find("Pause")
     assert resume is not None
     assert pause is not None
@@ -95,7 +95,7 @@ def test_an_allowed_press_reaches_the_app_and_a_disabled_one_is_refused(start_pa
 
 def test_a_press_that_raced_a_stop_is_refused(start_page: Start, stage: Stage) -> None:
     """The button was live when pressed on the page, but the state had moved on."""
-    client = connected(start_page("--no-scene3d"))
+    client = connected(start_page())
     stage.telemetry = stopped()
     assert client.read(10, lambda: 'data-state="STOPPED"' in client.html("op-state"))
     success = client.find("Mark success")
@@ -106,7 +106,7 @@ def test_a_press_that_raced_a_stop_is_refused(start_page: Start, stage: Stage) -
 
 
 def test_hostile_messages_change_nothing(start_page: Start, stage: Stage) -> None:
-    page = start_page("--no-scene3d")
+    page = start_page()
     client = connected(page)
     stop = client.find("STOP")
     assert stop is not None
@@ -126,24 +126,24 @@ def test_hostile_messages_change_nothing(start_page: Start, stage: Stage) -> Non
 
 
 def test_the_page_comes_back_after_sigkill_with_everything_in_it(start_page: Start, stage: Stage) -> None:
-    first = start_page("--no-scene3d")
+    first = start_page()
     connected(first)
     first.kill()
     stage.telemetry = replace(running(), attempt=3)
-    client = connected(start_page("--no-scene3d"))
+    client = connected(start_page())
     assert client.read(10, lambda: 'data-attempt="3"' in client.html("op-state"))
     assert client.read(10, lambda: "not solved" in client.html("op-history"))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it_with_zero(start_page: Start, number: signal.Signals) -> None:
-    page = start_page("--no-scene3d")
+    page = start_page()
     page.process.send_signal(number)
     assert page.process.wait(timeout=10) == 0
 
 
 def test_it_goes_with_its_parent(folder: Path, port: int) -> None:
-    arguments = ["-m", "ui.server", "--run-folder", str(folder), "--port", str(port), "--no-scene3d"]
+    arguments = ["-m", "ui.server", "--run-folder", str(folder), "--port", str(port), "--no-scene3d", "--no-rerun"]
     code = (
         "import subprocess, sys, time\n"
         f"child = subprocess.Popen([sys.executable, *{arguments!r}])\n"
