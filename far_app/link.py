@@ -43,7 +43,6 @@ class RemoteRobot:
         self._targets_lock, self._requests_lock = threading.Lock(), threading.Lock()
         self._news = threading.Condition()
         self._newest: Observation | None = None
-        self._handed: Observation | None = None
         self._acks: list[Ack] = []
         self._reply: Reply | None = None
         self._request_number = 0
@@ -108,6 +107,7 @@ class RemoteRobot:
             self._news.notify_all()
 
     def observe(self) -> Observation:
+        """The newest; each acknowledgment is handed out once."""
         with self._news:
             newest, reply = self._newest, self._reply
             silence = time.monotonic() - self._heard
@@ -116,12 +116,11 @@ class RemoteRobot:
                     f"no observation from the hw server for {silence:.1f} s (limit {SILENCE} s): it died, hangs or "
                     "was cut off; the arm holds by its watchdog; see the hw server's log, then start again"
                 )
-            if newest is not self._handed or self._acks:
-                self._observation = replace(newest, acks=tuple(self._acks))
-                self._acks, self._handed = [], newest
+            acks, self._acks = tuple(self._acks), []
+        newest = replace(newest, acks=acks)
         if reply is not None and newest.seq <= reply.seq:
-            return replace(self._observation, status=reply.status)
-        return self._observation
+            return replace(newest, status=reply.status)
+        return newest
 
     def age(self) -> float:
         """Seconds since the newest observation's pictures were captured; inf before the first."""
@@ -147,6 +146,7 @@ class RemoteRobot:
             raise RobotError(reply.error)
         with self._news:
             self._reply = reply
+            self._heard = time.monotonic()  # it answered: a reset that kept it busy is no silence
 
     def _tell(self, message: Target | Heartbeat) -> None:
         with self._targets_lock:

@@ -22,7 +22,7 @@ from far_app.telemetry import SceneGeometry, View
 from far_app.wire import pack
 from hw.cameras import Moment, TwinCamera
 from hw.plant import PlantView
-from hw.priority import CAMERA_NICENESS, nice
+from hw.priority import DRAWING_NICENESS, PROMPT_NICENESS, nice
 from hw.rig import RigConfig
 from hw.servo_thread import ServoThread
 
@@ -60,8 +60,7 @@ class CameraThread:
         self._watched = False
         self.geometry: SceneGeometry | None = None
         self.drawn = 0
-        self.seconds = 0.0
-        """Time spent drawing policy pictures."""
+        self._seconds = 0.0
         self._thread = threading.Thread(target=self._run, name="cameras", daemon=True)
 
     def start(self, timeout: float = 30.0) -> None:
@@ -72,18 +71,26 @@ class CameraThread:
         if self._error is not None:
             raise self._error
 
+    @property
+    def milliseconds(self) -> float:
+        """Time to draw the policy's pictures of one moment, mean."""
+        return 1e3 * self._seconds / max(1, self.drawn)
+
     def close(self) -> None:
         self._closing = True
         self._thread.join(timeout=2.0)
 
     def _run(self) -> None:
-        nice(CAMERA_NICENESS)
+        nice(DRAWING_NICENESS)  # inherited by the threads that GL contexts start
         try:
             view = self._make_view()
             policy = self._cameras(view, self._rig.policy_image)
             operator = self._cameras(view, self._rig.operator_image)
             self.geometry = view.geometry()
             self._draw(policy)
+            for camera in operator:
+                camera.frame()
+            nice(PROMPT_NICENESS)
         except Exception as error:  # GL back ends raise what they like
             self._error = error if isinstance(error, FarError) else GraphicsError(
                 f"the cameras could not be set up ({type(error).__name__}: {error}); see `far doctor`"
@@ -134,7 +141,7 @@ class CameraThread:
     def _draw(self, cameras: list[TwinCamera]) -> None:
         began = time.monotonic()
         images = {camera.name: camera.frame().image for camera in cameras}
-        self.seconds += time.monotonic() - began
+        self._seconds += time.monotonic() - began
         self.drawn += 1
         self._on_pictures(Pictures(images=images, stamp=self._moment.stamp, seq=self._moment.seq))
 

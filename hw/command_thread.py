@@ -16,7 +16,6 @@ from far_app.protocols import Heartbeat, Hold, Home, Reset, Resume
 from far_app.telemetry import GeometryRequest, SceneGeometry
 from far_app.types import Target
 from far_app.wire import WireError, pack, unpack
-from hw.priority import PROMPT_NICENESS, nice
 from hw.publisher_thread import PublisherThread
 from hw.servo_thread import ServoThread
 
@@ -54,7 +53,6 @@ class CommandThread:
         self._thread.join(timeout=2.0)
 
     def _run(self) -> None:
-        nice(PROMPT_NICENESS)
         self._commands = self._context.socket(zmq.ROUTER)
         geometry = self._context.socket(zmq.REP)
         for socket, endpoint in ((self._commands, self._endpoints.commands), (geometry, self._endpoints.geometry)):

@@ -10,8 +10,10 @@ SERVO_PRIORITY = 20
 """SCHED_FIFO priority of the servo thread; 1 to 99."""
 SERVO_NICENESS = -15
 PROMPT_NICENESS = -10
-CAMERA_NICENESS = 5
-"""Drawing yields to everything; the GL driver's worker threads inherit it."""
+"""Every thread that runs Python beside the servo thread: one that is not scheduled while it holds the interpreter
+would keep the servo thread waiting."""
+DRAWING_NICENESS = -5
+"""The GL driver's worker threads: before anything on the machine that did not ask, after the loop."""
 _PR_SET_TIMERSLACK = 29
 
 

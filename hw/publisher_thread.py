@@ -14,7 +14,6 @@ import zmq
 from far_app.wire import pack
 from hw.camera_thread import Pictures
 from hw.observing import observation
-from hw.priority import PROMPT_NICENESS, nice
 from hw.servo_thread import ServoThread
 
 
@@ -52,7 +51,6 @@ class PublisherThread:
         self._thread.join(timeout=2.0)
 
     def _run(self) -> None:
-        nice(PROMPT_NICENESS)
         socket = self._context.socket(zmq.PUB)
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.SNDHWM, 64)

@@ -38,6 +38,7 @@ from hw.camera_thread import CameraThread
 from hw.command_thread import CommandThread
 from hw.controller import ArmController
 from hw.plant import Plant, PlantView
+from hw.priority import PROMPT_NICENESS, nice
 from hw.publisher_thread import PublisherThread
 from hw.rig import RigConfig, load_rig
 from hw.servo_thread import ServoThread
@@ -89,8 +90,8 @@ class Server:
     def start(self) -> None:
         """Returns when everything runs; raises a FarError where it cannot."""
         self.stop.start()
+        self.cameras.start()  # first: setting up GL holds the interpreter for a second or two
         self.servo.start()
-        self.cameras.start()
         self.publisher.start()
         self.commands.start()
 
@@ -103,6 +104,8 @@ class Server:
         for part in (self.commands, self.cameras, self.publisher, self.stop, self.servo):
             part.close()
         self.context.destroy(linger=0)
+        log.info("%s", self.servo.report())
+        log.info("cameras: %d moments, %.1f ms each", self.cameras.drawn, self.cameras.milliseconds)
 
 
 def wait_for_the_end(parent: int | None) -> str:
@@ -158,6 +161,7 @@ def main(arguments: list[str] | None = None) -> int:
     os.dup2(2, 1)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     sys.setswitchinterval(0.0005)
+    nice(PROMPT_NICENESS)  # inherited by ZeroMQ's own threads
     cv2.setNumThreads(1)
 
     def say(words: dict[str, object]) -> None:

@@ -100,6 +100,14 @@ class ServoThread:
                 return self.newest.moment
         return None
 
+    def report(self) -> str:
+        """How well it kept time, for the log."""
+        late = 1e3 * np.percentile(self.lateness[: max(1, self.ticks)], (50, 99, 100))
+        return (
+            f"servo: {self.ticks} ticks, late ms p50 {late[0]:.2f}, p99 {late[1]:.2f}, max {late[2]:.2f}; "
+            f"re-anchored {self.re_anchored}, scheduling {self.scheduling}"
+        )
+
     def close(self) -> None:
         self._closing = True
         self._thread.join(timeout=2.0)
