@@ -1,0 +1,107 @@
+"""Training: repeatable, resumable, and it learns."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from far_app.errors import ConfigError, RecordingError
+from far_app.learning.dataset import Episode, read_episodes, write_episode
+from far_app.learning.policy import fingerprint, load_policy, preset
+from far_app.learning.train_policy import DemonstrationArrays, PolicyTraining, learning_rate, train_policy
+
+CONFIG = dataclasses.replace(preset("quickstart", "lift"), image_size=16, widths=(16, 32, 64))
+TRAINING = PolicyTraining(iterations=6, batch=8, segment=4, draws=2, shift=2, save_every=3, log_every=2, localise=1.0)
+
+
+def episodes(count: int = 3, length: int = 12, size: int = 16) -> list[Episode]:
+    rng = np.random.default_rng(0)
+    return [
+        Episode(
+            images={c: rng.integers(0, 256, (length, size, size, 3), np.uint8) for c in ("front", "wrist")},
+            states=rng.normal(size=(length, 8)).astype(np.float32),
+            actions=rng.uniform(-1, 1, (length, 7)).astype(np.float32), rewards=np.zeros(length, np.float32),
+            successes=np.zeros(length, bool), success=True, seed=i, objects=rng.normal(size=(length, 7)),
+        )
+        for i in range(count)
+    ]  # fmt: skip
+
+
+def test_segments_never_cross_an_episode_and_chunks_repeat_the_last_action():
+    some = episodes()
+    arrays = DemonstrationArrays(some, CONFIG, shift=0)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        images, states, chunks, _ = arrays.segments(2, 4, rng)
+        for row in range(2):
+            episode = next(e for e in some if (states[row, -1].numpy() == e.states).all(axis=1).any())
+            last = int(np.flatnonzero((states[row, -1].numpy() == episode.states).all(axis=1))[0])
+            ticks = np.clip(np.arange(last - 4, last + 1), 0, None)
+            assert (images["front"][row].numpy()[1:] == episode.images["front"][ticks[1:]]).all()
+            wanted = episode.actions[np.minimum(last + np.arange(8), len(episode) - 1)]
+            assert np.allclose(chunks[row, -1], wanted)
+
+
+def test_the_same_seed_gives_the_same_weights(tmp_path):
+    first = train_policy(episodes(), CONFIG, TRAINING, tmp_path / "a")
+    second = train_policy(episodes(), CONFIG, TRAINING, tmp_path / "b")
+    assert fingerprint(load_policy(first)) == fingerprint(load_policy(second))
+
+
+def test_an_interrupted_run_ends_with_the_same_weights(tmp_path, monkeypatch):
+    whole = train_policy(episodes(), CONFIG, TRAINING, tmp_path / "whole")
+    calls = {"n": 0}
+    draw = DemonstrationArrays.segments
+
+    def until_killed(self, *arguments):
+        calls["n"] += 1
+        if calls["n"] == 5:
+            raise KeyboardInterrupt
+        return draw(self, *arguments)
+
+    monkeypatch.setattr(DemonstrationArrays, "segments", until_killed)
+    with pytest.raises(KeyboardInterrupt):
+        train_policy(episodes(), CONFIG, TRAINING, tmp_path / "parts")
+    monkeypatch.undo()
+    resumed = train_policy(episodes(), CONFIG, TRAINING, tmp_path / "parts")
+    assert fingerprint(load_policy(resumed)) == fingerprint(load_policy(whole))
+
+
+def test_the_loss_falls_on_one_demonstration(tmp_path):
+    training = dataclasses.replace(
+        TRAINING, iterations=60, log_every=20, lr=3e-3, save_every=1000, warmup=5, localise=0.0
+    )
+    (episode,) = episodes(1)
+    still = dataclasses.replace(episode, actions=np.full_like(episode.actions, 0.4))
+    train_policy([still], CONFIG, training, tmp_path)
+    losses = [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert losses[-1] < 0.7 * losses[0]
+
+
+def test_a_folder_of_other_settings_is_refused(tmp_path):
+    train_policy(episodes(), CONFIG, TRAINING, tmp_path)
+    with pytest.raises(ConfigError, match="other settings"):
+        train_policy(episodes(), CONFIG, dataclasses.replace(TRAINING, lr=1e-3), tmp_path)
+
+
+def test_learning_rate_warms_up_and_ends_low():
+    training = PolicyTraining()
+    assert learning_rate(training, 0) == pytest.approx(1e-6)
+    assert learning_rate(training, 100) == pytest.approx(1e-4)
+    assert learning_rate(training, 29_999) == pytest.approx(1e-5, rel=1e-3)
+
+
+def test_demonstrations_survive_the_disk(tmp_path):
+    path, (episode,) = tmp_path / "d.hdf5", episodes(1)
+    for _ in range(2):
+        write_episode(path, episode, np.zeros((len(episode), 7)), {"env_name": "Lift", "type": 1, "env_kwargs": {}})
+    again = read_episodes(path, ("front", "wrist"))
+    assert len(again) == 2
+    assert all((again[0].images[c] == episode.images[c]).all() for c in ("front", "wrist"))
+    assert np.array_equal(again[0].actions, episode.actions)
+    assert np.array_equal(again[0].states, episode.states)
+    with pytest.raises(RecordingError, match="no images of side"):
+        read_episodes(path, ("side",))
+    with pytest.raises(RecordingError, match="far demo"):
+        read_episodes(tmp_path / "none.hdf5", ("front",))

@@ -1,0 +1,63 @@
+"""The evaluation keeps what it has, refuses to mix, and runs a shared first attempt once."""
+
+import dataclasses
+import json
+
+import pytest
+
+from far_app.config import RetryConfig
+from far_app.errors import ConfigError
+from far_app.evaluation import Arm, EvaluationPlan, evaluate, read_results, run_scene
+from far_app.types import Attempt, Judge, Outcome, Trial
+
+PLAN = EvaluationPlan(
+    task="lift", rig="twin", policy="p", critic="c", first_scene=100, scenes=3, max_attempts=2,
+    arms=tuple(Arm(name=n, method=n, retry=RetryConfig()) for n in ("nr", "far")),
+)  # fmt: skip
+BEGUN: list[str] = []
+WORKED: list[int] = []
+
+
+def begin(plan):
+    BEGUN.append(plan.task)
+
+
+def work(job):
+    scene, done = job
+    WORKED.append(scene)
+    return [{"arm": a, "scene": scene, "success": True, "attempts": 1} for a in ("nr", "far") if a not in done]
+
+
+def test_a_second_start_does_only_what_is_missing(tmp_path):
+    WORKED.clear()
+    evaluate(tmp_path, PLAN, 1, lambda record: None, begin, work)
+    assert sorted(WORKED) == [100, 101, 102]
+    lines = (tmp_path / "episodes.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "episodes.jsonl").write_text("".join(lines[:-1]) + lines[-1][:10])  # a killed run's torn line
+    WORKED.clear()
+    evaluate(tmp_path, PLAN, 1, lambda record: None, begin, work)
+    assert WORKED == [102]
+    found = {(r["scene"], r["arm"]) for r in read_results(tmp_path / "episodes.jsonl")}
+    assert found == {(s, a) for s in (100, 101, 102) for a in ("nr", "far")}
+
+
+def test_results_of_another_plan_are_refused(tmp_path):
+    evaluate(tmp_path, PLAN, 1, lambda record: None, begin, work)
+    with pytest.raises(ConfigError, match="another plan"):
+        evaluate(tmp_path, dataclasses.replace(PLAN, max_attempts=5), 1, lambda record: None, begin, work)
+    assert json.loads((tmp_path / "plan.json").read_text())["max_attempts"] == 2
+
+
+def test_a_first_attempt_success_is_run_once():
+    calls = []
+
+    def run(method, scene):
+        calls.append(method)
+        outcome = Outcome(success=True, judged_by=Judge.TWIN)
+        attempt = Attempt(index=1, scene_seed=scene, steps=(), final=None, outcome=outcome, policy_version="base")
+        return Trial(scene_seed=scene, attempts=(attempt,), adaptations=())
+
+    records = list(run_scene(5, {"nr": "m1", "far": "m2"}, {}, run))
+    assert calls == ["m1"]
+    assert [r["arm"] for r in records] == ["nr", "far"]
+    assert records[1]["shared"]
