@@ -66,23 +66,23 @@ class Child:
         return self._process.poll() is None
 
     def last_words(self) -> str:
-        """Its last line of output, which is the error where it ended with one."""
+        """Its last line of output that tells of an error, else its last line."""
         try:
             lines = self.log_path.read_text(errors="replace").strip().splitlines()
         except OSError:
             return ""
-        last = lines[-1] if lines else ""
+        last = next((line for line in reversed(lines) if "Error" in line or " ERROR " in line), (lines or [""])[-1])
         if last.startswith("{"):
             with contextlib.suppress(ValueError):
                 return str(json.loads(last).get("error", last))
         return last
 
-    def check(self) -> None:
-        """Raise ProcessError when it has ended."""
+    def check(self, before: str = "") -> None:
+        """Raise ProcessError when it has ended; `before` is what is known besides."""
         code = self._process.poll()
         if code is not None:
             words = self.last_words() or "it said nothing"
-            raise ProcessError(f"the {self.name} process ended with status {code}: {words}")
+            raise ProcessError(f"{before}the {self.name} process ended with status {code}: {words}")
 
     def end(self, patience: float = 5.0) -> None:
         """SIGTERM, then SIGKILL after `patience` seconds; a stopped (frozen) process is woken to hear it."""

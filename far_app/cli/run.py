@@ -20,6 +20,7 @@ from far_app.errors import ConfigError
 from far_app.session.inbox import IntentInbox
 from far_app.session.session import TrialResult
 from far_app.session.statistics import LoopStatistics
+from far_app.session.supervision import SessionFault
 from far_app.session_states import Intent
 
 
@@ -51,6 +52,9 @@ def run(options: RunOptions) -> tuple[list[TrialResult], LoopStatistics]:
         try:
             with stage_.session(writer, inbox, statistics) as session:
                 session.run()
+        except SessionFault as fault:
+            stage_.hardware.check(f"{fault}; ")
+            raise
         finally:
             inbox.close()
         if session.recorder.error is not None:

@@ -52,6 +52,7 @@ class Stage:
     robot: RemoteRobot
     folder: Path
     family: Family
+    hardware: Child
     page: Child | None
     page_url: str
 
@@ -112,7 +113,8 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         prepare_process(options.torch_threads)
         warm_up(parts.method.policy, robot)
         yield Stage(
-            options=options, task=task, rig=rig, parts=parts, robot=robot, folder=folder, family=family, page=page,
+            options=options, task=task, rig=rig, parts=parts, robot=robot, folder=folder, family=family,
+            hardware=hardware, page=page,
             page_url=f"http://{options.host}:{port}" if page is not None else "",
         )  # fmt: skip
 

@@ -175,7 +175,8 @@ class Supervision:
         self.recorder.event("stale", self.board.reason, {"age": self.robot.age()})
         self._hold(self.board.reason)
         while self.robot.age() > self.freshness.stale_after and self.state is State.RUNNING:
-            if time.monotonic() - began > self.freshness.limit:
+            self._fetch()  # a link that fell silent says so itself
+            if self.state is State.RUNNING and time.monotonic() - began > self.freshness.limit:
                 self.fault(
                     f"observations were stale for {time.monotonic() - began:.1f} s (limit {self.freshness.limit:g} s), "
                     f"the newest is {self.robot.age():.2f} s old (fresh is {self.freshness.stale_after:g} s): the "
@@ -184,7 +185,6 @@ class Supervision:
                 return True
             self.show()
             time.sleep(self.clock.period)
-            self._fetch()
             self._drain("attempt")
             self._notice("attempt")
         self.clock.restart()
