@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from far_app.protocols import Heartbeat, Hold, Home, Reset, Resume
 from far_app.telemetry import GeometryRequest, SceneGeometry
 from far_app.types import Target
 from far_app.wire import WireError, pack, unpack
+from hw.picture_timing import PictureTiming
 from hw.publisher_thread import PublisherThread
 from hw.servo_thread import ServoThread
 
@@ -32,9 +34,10 @@ class CommandThread:
 
     def __init__(
         self, servo: ServoThread, publisher: PublisherThread, geometry: Callable[[], SceneGeometry | None],
-        context: zmq.Context[zmq.Socket[bytes]], endpoints: Endpoints,
+        timing: PictureTiming, context: zmq.Context[zmq.Socket[bytes]], endpoints: Endpoints,
     ) -> None:  # fmt: skip
         self._servo, self._publisher, self._geometry = servo, publisher, geometry
+        self._timing = timing
         self._context, self._endpoints = context, endpoints
         self._closing = False
         self._pending: list[tuple[Future[None], list[bytes]]] = []
@@ -92,6 +95,9 @@ class CommandThread:
                 controller.request(message, time.monotonic())
         if isinstance(message, Target):
             self._publisher.wake()
+            lead = self._publisher.lead(message.due)
+            if math.isfinite(lead):
+                self._servo.shift_pictures(self._timing.shift(lead))
 
     def _request(self, address: list[bytes], request: Home | Hold | Resume | Heartbeat | Reset) -> None:
         if isinstance(request, Reset):

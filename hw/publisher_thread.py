@@ -6,8 +6,10 @@ drawing thus never hides the robot's status; `stamp` tells how old the pictures 
 
 from __future__ import annotations
 
+import math
 import threading
 import time
+from collections import deque
 
 import zmq
 
@@ -28,6 +30,7 @@ class PublisherThread:
         self._fresh = False
         self._pictures = Pictures(images={}, stamp=servo.newest.stamp, seq=-1)
         self._closing = False
+        self._picture_times: deque[float] = deque([0.0], maxlen=3)
         self.seq = 0
         self._thread = threading.Thread(target=self._run, name="publisher", daemon=True)
 
@@ -45,6 +48,10 @@ class PublisherThread:
             self._fresh = True
             self._news.notify()
 
+    def lead(self, due: float) -> float:
+        """Seconds from the publication of the newest pictures before this moment to the moment."""
+        return min((due - t for t in list(self._picture_times) if t <= due), default=math.nan)
+
     def close(self) -> None:
         self._closing = True
         self.wake()
@@ -55,6 +62,7 @@ class PublisherThread:
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.SNDHWM, 64)
         socket.bind(self._endpoint)
+        shown = -1
         latest = time.monotonic() + self._longest
         while not self._closing:
             with self._news:
@@ -66,5 +74,8 @@ class PublisherThread:
             newest, pictures = self._servo.newest, self._pictures
             message = observation(self.seq, pictures.stamp, newest.measured, status, acks, pictures.images)
             socket.send(pack(message), zmq.NOBLOCK)
+            if pictures.seq != shown:
+                shown = pictures.seq
+                self._picture_times.append(time.monotonic())
             latest = time.monotonic() + self._longest
         socket.close()

@@ -37,6 +37,7 @@ from far_app.tasks import task as task_named
 from hw.camera_thread import CameraThread
 from hw.command_thread import CommandThread
 from hw.controller import ArmController
+from hw.picture_timing import PictureTiming
 from hw.plant import Plant, PlantView
 from hw.priority import PROMPT_NICENESS, nice
 from hw.publisher_thread import PublisherThread
@@ -78,8 +79,9 @@ class Server:
         self.cameras = CameraThread(
             make_view, rig, task, self.servo, self.context, endpoints.view, self.publisher.pictures, self._lost
         )
+        timing = PictureTiming(1.0 / self.plant.servo_hz, 1.0 / task.rate)
         self.commands = CommandThread(
-            self.servo, self.publisher, lambda: self.cameras.geometry, self.context, endpoints
+            self.servo, self.publisher, lambda: self.cameras.geometry, timing, self.context, endpoints
         )
         self.stop = StopThread(self.servo, endpoints.stop)
 

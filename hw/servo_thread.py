@@ -47,6 +47,7 @@ class ServoThread:
         self._lock = threading.Lock()
         self._calls: queue.SimpleQueue[tuple[Callable[[], None], Future[None]]] = queue.SimpleQueue()
         self._per_picture = max(1, round(plant.servo_hz / camera_rate))
+        self._next_picture = 1
         self._closing = False
         self._snapped = threading.Condition()
         now = time.monotonic()
@@ -92,6 +93,10 @@ class ServoThread:
                 self._controller.reset(self._plant.measure(), seed)
 
         return self.call(work)
+
+    def shift_pictures(self, ticks: int) -> None:
+        """Take the next snapshot so many servo ticks later or earlier, and all after it at the usual distance."""
+        self._next_picture += ticks
 
     def wait_for_moment(self, after: int, timeout: float) -> Moment | None:
         """The newest snapshot, once there is one later than that number."""
@@ -146,11 +151,12 @@ class ServoThread:
             pose, gripper = self._controller.tick(now, measured)
         self._plant.servo(pose, gripper)
         self._plant.advance()
-        moment = self.newest.moment
-        if self.ticks % self._per_picture == 0:
+        moment, snap = self.newest.moment, self.ticks >= self._next_picture
+        if snap:
             moment = Moment(snapshot=self._plant.snapshot(), stamp=time.monotonic(), seq=moment.seq + 1)
         self.newest = Newest(measured=self._plant.measure(), stamp=time.monotonic(), moment=moment)
-        if self.ticks % self._per_picture == 0:
+        if snap:
+            self._next_picture = self.ticks + self._per_picture
             with self._snapped:
                 self._snapped.notify_all()
 
