@@ -129,7 +129,10 @@ def evaluate(
     names = {a.name for a in plan.arms}
     scenes = range(plan.first_scene, plan.first_scene + plan.scenes)
     jobs = [(s, found.get(s, {})) for s in scenes if names - set(found.get(s, {}))]
-    with (folder / "episodes.jsonl").open("a") as file:
+    results = folder / "episodes.jsonl"
+    if results.exists() and not (whole := results.read_bytes()).endswith(b"\n"):
+        results.write_bytes(whole[: whole.rfind(b"\n") + 1])  # a killed run's torn line; its episode is run again
+    with results.open("a") as file:
         for records in _results(plan, jobs, workers, begin, work):
             for record in records:
                 file.write(json.dumps(record) + "\n")
