@@ -37,7 +37,7 @@ class RemoteRobot:
     def __init__(self, endpoints: Endpoints, connect_timeout: float = 30.0) -> None:
         """Waits for the first observation; raises RobotError when none comes within connect_timeout seconds."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._endpoints = endpoints
+        self.endpoints = endpoints
         self._targets = self._dealer(send_limit=16)
         self._requests = self._dealer(send_limit=16)
         self._targets_lock, self._requests_lock = threading.Lock(), threading.Lock()
@@ -71,7 +71,7 @@ class RemoteRobot:
         socket = self._context.socket(zmq.DEALER)
         socket.setsockopt(zmq.SNDHWM, send_limit)
         socket.setsockopt(zmq.LINGER, 0)
-        socket.connect(self._endpoints.commands)
+        socket.connect(self.endpoints.commands)
         return socket
 
     # ── observations ──
@@ -81,7 +81,7 @@ class RemoteRobot:
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.RCVHWM, 256)
         socket.subscribe(b"")
-        socket.connect(self._endpoints.observations)
+        socket.connect(self.endpoints.observations)
         while not self._closed:
             if not socket.poll(int(1000 * POLL)):
                 continue

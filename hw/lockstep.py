@@ -50,7 +50,8 @@ class LockstepRobot:
         return self.now
 
     def observe(self) -> Observation:
-        """This moment; drawn at the first call after each advance. The same object again until something happens."""
+        """This moment; drawn at the first call after each advance. The same object again, acknowledgments included,
+        until something happens."""
         if self._closed:
             raise RobotError("this robot was closed; make another")
         if self._observation is None:

@@ -121,6 +121,8 @@ class LockstepBench(Bench):
 
 
 class RemoteBench(Bench):
+    robot: RemoteRobot
+
     def now(self) -> float:
         return time.monotonic()
 

@@ -24,7 +24,7 @@ from hw.safety import Along, Brake, Follow, SafetyState, Verdict, safety_filter,
 LIMITS = SafetyLimits(box_min=(0.2, -0.3, -0.1), box_max=(0.7, 0.3, 0.4))
 PERIOD, RAMP = 1 / 120, 4
 SLACK = 1e-9
-FAST = settings(deadline=None, database=None, suppress_health_check=list(HealthCheck))
+FAST = settings(deadline=None, database=None, suppress_health_check=[*HealthCheck])
 SEEDS = st.integers(0, 2**48)
 
 
@@ -39,7 +39,7 @@ def law(holds: bool, name: str, detail: object = "") -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
-    before: Verdict | SafetyState
+    before: SafetyState
     command: Target | Follow | Along | Brake
     verdict: Verdict
 

@@ -170,7 +170,7 @@ def test_a_told_server_ends_cleanly(number: signal.Signals) -> None:
 
 
 def test_the_page_gets_pictures_and_geometry(remote: RemoteBench) -> None:
-    endpoints = remote.robot._endpoints
+    endpoints = remote.robot.endpoints
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     view_socket, geometry_socket = context.socket(zmq.SUB), context.socket(zmq.REQ)
     view_socket.subscribe(b"")
@@ -191,7 +191,7 @@ def test_the_page_gets_pictures_and_geometry(remote: RemoteBench) -> None:
 
 
 def test_junk_on_its_sockets_does_not_disturb_it(remote: RemoteBench) -> None:
-    endpoints = remote.robot._endpoints
+    endpoints = remote.robot.endpoints
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     commands, geometry = context.socket(zmq.DEALER), context.socket(zmq.REQ)
     commands.connect(endpoints.commands)
