@@ -60,7 +60,7 @@ def main(arguments: Sequence[str]) -> int:
 def measure(options: AdaptOptions) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="far-bench-") as recordings:
         run = RunOptions(
-            seed=options.seed, policy=options.policy, critic=options.critic, method="far", headless=True,
+            seed=options.seed, policy=options.policy, critic=options.critic, method="far", headless=True, rerun=False,
             torch_threads=options.torch_threads, recordings=Path(recordings),
         )  # fmt: skip
         with stage(run) as stage_:

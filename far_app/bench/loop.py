@@ -69,7 +69,7 @@ def measure(options: LoopOptions) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="far-bench-") as recordings:
         run = RunOptions(
             seed=options.seed, policy=options.policy, critic=options.critic, port=options.port, method="far",
-            headless=not options.page, torch_threads=options.torch_threads, recordings=Path(recordings),
+            headless=not options.page, rerun=False, torch_threads=options.torch_threads, recordings=Path(recordings),
         )  # fmt: skip
         with stage(run) as stage_, client(stage_.page_url, options.seconds) as connected:
             half = options.seconds / 2

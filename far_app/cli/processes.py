@@ -42,8 +42,9 @@ def run_folder() -> Iterator[Path]:
 class Child:
     """One process of the run: `python -m module …`."""
 
-    def __init__(self, name: str, module: str, arguments: Sequence[str], folder: Path) -> None:
-        self.name, self._command = name, [sys.executable, "-m", module, *arguments]
+    def __init__(self, name: str, module: str, arguments: Sequence[str], folder: Path, patience: float = 5.0) -> None:
+        """`patience`: seconds it is given to end by itself once told to."""
+        self.name, self._command, self._patience = name, [sys.executable, "-m", module, *arguments], patience
         self.log_path = folder / f"{name}.log"
         self.starts = 0
         self._process: subprocess.Popen[bytes]
@@ -84,17 +85,17 @@ class Child:
             words = self.last_words() or "it said nothing"
             raise ProcessError(f"{before}the {self.name} process ended with status {code}: {words}")
 
-    def end(self, patience: float = 5.0) -> None:
-        """SIGTERM, then SIGKILL after `patience` seconds; a stopped (frozen) process is woken to hear it."""
+    def end(self) -> None:
+        """SIGTERM, then SIGKILL when patience is over; a stopped (frozen) process is woken to hear it."""
         if not self.alive():
             return
         with contextlib.suppress(ProcessLookupError):
             self._process.terminate()
             self._process.send_signal(signal.SIGCONT)
         try:
-            self._process.wait(patience)
+            self._process.wait(self._patience)
         except subprocess.TimeoutExpired:
-            log.warning("%s did not end within %.0f s; killed", self.name, patience)
+            log.warning("%s did not end within %.0f s; killed", self.name, self._patience)
             self._process.kill()
             self._process.wait()
         with contextlib.suppress(ProcessLookupError, PermissionError):

@@ -76,6 +76,8 @@ class Stage:
         """A session on this stage, with the page told about it and revived when it dies."""
         options = self.options
         publisher = None
+        if options.rerun:
+            self.family.add(Child("rrd", "far_app.cli.rrd", [str(writer.folder)], self.folder, patience=30.0))
         if self.page is not None:
             publisher = TelemetryPublisher(Endpoints.in_folder(self.folder).telemetry, statistics.health)
         try:
@@ -126,8 +128,8 @@ def start_hardware(folder: Path, rig: str, task: str) -> Child:
 
 def start_page(folder: Path, options: RunOptions, port: int) -> Child:
     arguments = ["--run-folder", str(folder), "--host", options.host, "--port", str(port)]
-    if not options.scene3d:
-        arguments.append("--no-scene3d")
+    arguments += ["--recordings", str(options.recordings.absolute())]
+    arguments += ["--no-scene3d"] * (not options.scene3d) + ["--no-rerun"] * (not options.rerun)
     return Child("page", "ui.server", arguments, folder)
 
 
