@@ -40,12 +40,15 @@ def blueprint(cameras: Sequence[str] = ("front", "wrist"), *, live: bool = False
     left = rrb.Vertical(
         rrb.Horizontal(*views), rrb.TextLogView(origin="/events", name="Events"), row_shares=[3, 2], name="Cameras"
     )
+    hidden, corner = rrb.PlotLegend(visible=False), rrb.PlotLegend("RightTop")
     right = rrb.Vertical(
-        rrb.TimeSeriesView(origin="/value", name="Value V(s)"),
+        rrb.TimeSeriesView(origin="/value", name="Value V(s), flagged red", plot_legend=hidden),
         rrb.StateTimelineView(origin="/flagged", name="Flagged chunks"),
-        rrb.TimeSeriesView(origin="/change", name="Value change ΔV per chunk"),
-        rrb.TimeSeriesView(origin="/action", name="Action sent"),
-        rrb.TimeSeriesView(origin="/joints", name="Joints, rad"),
+        rrb.TimeSeriesView(
+            origin="/change", name="Value change ΔV per chunk, flagged at or below red", plot_legend=hidden
+        ),
+        rrb.TimeSeriesView(origin="/action", name="Action sent", plot_legend=corner),
+        rrb.TimeSeriesView(origin="/joints", name="Joints, rad", plot_legend=corner),
         row_shares=[4, 2, 3, 3, 3],
     )
     return rrb.Blueprint(
@@ -81,6 +84,7 @@ def log_styles(recording: rr.RecordingStream) -> None:
 
     style("/value/V", rr.SeriesLines(colors=BLUE, names="V(s)", widths=2.0))
     style("/value/flagged", rr.SeriesPoints(colors=RED, names="flagged", marker_sizes=4.0))
+    style("/flagged", rr.StateConfiguration(values=["flagged", ""], colors=[RED, (0, 0, 0)], visible=[True, False]))
     style("/change/dV", rr.SeriesLines(colors=GREY, names="ΔV", widths=1.5))
     style("/change/threshold", rr.SeriesLines(colors=RED, names="threshold", widths=1.0))
     style("/change/flagged", rr.SeriesPoints(colors=RED, names="flagged", marker_sizes=4.0))
