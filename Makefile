@@ -5,7 +5,6 @@
 
 VENV := .venv
 INPUTS := pyproject.toml constraints.txt scripts/set-up
-export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/cache/numba
 export PYTHONUNBUFFERED := 1
 
 .PHONY: run test lint
