@@ -31,7 +31,7 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     orphaned = die_with_parent()
     with contextlib.suppress(OSError):
-        os.nice(15)
+        os.setpriority(os.PRIO_PROCESS, 0, 15)
     session, refused = Path(sys.argv[1]), set[Path]()
     last = False
     while not last and not orphaned():
