@@ -19,47 +19,51 @@ from far_app.errors import PolicyError
 
 BISECTIONS = 5
 """λ is found to within 1/32."""
-PIECE = 2**15
-"""Elements worked on at a time, so that a step's dozen operations stay in the cache."""
+PIECE = 2**16
+"""Elements looked at together by `slope`, so that its dozen operations stay in the cache."""
 
 
 class FlatAdamW:
-    """The weights and moments of one update. The given parameters become views of one flat tensor, `weights`."""
+    """torch's fused AdamW over one flat tensor, `weights`, of which the given parameters become views."""
 
-    def __init__(
-        self, parameters: Sequence[Tensor], lr: float, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-8
-    ) -> None:
-        self.lr, self.betas, self.eps = lr, betas, eps
+    def __init__(self, parameters: Sequence[Tensor], lr: float) -> None:
         self.weights = torch.cat([p.detach().flatten() for p in parameters])
         for p, part in zip(parameters, self.weights.split([p.numel() for p in parameters]), strict=True):
             p.data = part.view(p.shape)
-        self.m, self.v, self.steps = torch.zeros_like(self.weights), torch.zeros_like(self.weights), 0
+        self._torch = torch.optim.AdamW([self.weights], lr=lr, weight_decay=0.0, fused=True)
+        self.lr = lr
+        self.betas: tuple[float, float] = self._torch.defaults["betas"]
+        self.eps: float = self._torch.defaults["eps"]
 
-    def slope(self, g_winner: Float[Tensor, "P"], g_loser: Float[Tensor, "P"], share: float) -> float:
-        """⟨g⁺, Δθ⟩ of the step that g⁺ + share · g⁻ would make; nothing is changed."""
-        vectors = (g_winner, g_loser, self.m, self.v)
-        total = 0.0
-        for winner, loser, m, v in zip(*(x.split(PIECE) for x in vectors), strict=True):
-            gradient = torch.add(winner, loser, alpha=share)
-            total += float(winner @ self._change(gradient, m * self.betas[0], v * self.betas[1], self.steps + 1))
-        return total
+    def moments(self) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"], int]:
+        """(m, v, steps taken)."""
+        state = self._torch.state[self.weights]
+        if not state:
+            zeros = torch.zeros_like(self.weights)
+            return zeros, zeros, 0
+        return state["exp_avg"], state["exp_avg_sq"], int(state["step"])
+
+    def forget_momentum(self) -> None:
+        self.moments()[0].zero_()
 
     def step(self, gradient: Float[Tensor, "P"]) -> None:
         """Take the step. Raises PolicyError when the gradient is not finite; nothing is changed then."""
-        if not bool(torch.isfinite(gradient).all()):
+        if not bool(torch.isfinite(gradient.sum())):
             raise PolicyError("the gradient of the adaptation is not finite; lower fcpa.lr")
-        self.steps += 1
-        vectors = (self.weights, gradient, self.m, self.v)
-        for weights, g, m, v in zip(*(x.split(PIECE) for x in vectors), strict=True):
-            weights.add_(self._change(g, m.mul_(self.betas[0]), v.mul_(self.betas[1]), self.steps))
+        self.weights.grad = gradient
+        self._torch.step()
 
-    def _change(self, gradient: Tensor, m: Tensor, v: Tensor, t: int) -> Tensor:
-        """Δθ, with the decayed moments m and v brought up to date in place."""
+    def slope(self, g_winner: Float[Tensor, "P"], g_loser: Float[Tensor, "P"], share: float) -> float:
+        """⟨g⁺, Δθ⟩ of the step that g⁺ + share · g⁻ would make; nothing is changed."""
         b1, b2 = self.betas
-        m.add_(gradient, alpha=1 - b1)
-        v.addcmul_(gradient, gradient, value=1 - b2)
-        scale = (v / (1 - b2**t)).sqrt_().add_(self.eps)
-        return (m * (-self.lr / (1 - b1**t))).div_(scale)
+        m, v, steps = self.moments()
+        total = 0.0
+        for winner, loser, m_, v_ in zip(*(x.split(PIECE) for x in (g_winner, g_loser, m, v)), strict=True):
+            gradient = torch.add(winner, loser, alpha=share)
+            scale = (b2 * v_).addcmul_(gradient, gradient, value=1 - b2).div_(1 - b2 ** (steps + 1)).sqrt_()
+            change = (b1 * m_).add_(gradient, alpha=1 - b1).div_(scale.add_(self.eps))
+            total += float(winner @ change)
+        return -self.lr / (1 - b1 ** (steps + 1)) * total
 
 
 def guarded_step(optimiser: FlatAdamW, g_winner: Float[Tensor, "P"], g_loser: Float[Tensor, "P"]) -> float:
@@ -79,6 +83,6 @@ def guarded_step(optimiser: FlatAdamW, g_winner: Float[Tensor, "P"], g_loser: Fl
             share, too_much = (middle, too_much) if harmless(middle) else (share, middle)
     else:
         share = 0.0
-        optimiser.m.zero_()
+        optimiser.forget_momentum()
     optimiser.step(torch.add(g_winner, g_loser, alpha=share))
     return share

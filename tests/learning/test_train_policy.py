@@ -9,7 +9,8 @@ import pytest
 from far_app.errors import ConfigError, RecordingError
 from far_app.learning.dataset import Episode, read_episodes, write_episode
 from far_app.learning.policy import fingerprint, load_policy, preset
-from far_app.learning.train_policy import DemonstrationArrays, PolicyTraining, learning_rate, train_policy
+from far_app.learning.segments import DemonstrationArrays
+from far_app.learning.train_policy import PolicyTraining, learning_rate, train_policy
 
 CONFIG = dataclasses.replace(preset("quickstart", "lift"), image_size=16, widths=(16, 32, 64))
 TRAINING = PolicyTraining(iterations=6, batch=8, segment=4, draws=2, shift=2, save_every=3, log_every=2, localise=1.0)
