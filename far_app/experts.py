@@ -44,7 +44,8 @@ class Style:
     def draw(cls, rng: np.random.Generator) -> Style:
         return cls(
             speed=rng.uniform(0.7, 1.0), noise=rng.uniform(0.02, 0.10), hover=rng.uniform(0.05, 0.10),
-            offset=rng.normal(0.0, (0.003, 0.003, 0.002)), via=rng.uniform(-0.05, 0.05, 2), dwell=int(rng.integers(12, 18)),
+            offset=rng.normal(0.0, (0.003, 0.003, 0.002)), via=rng.uniform(-0.05, 0.05, 2),
+            dwell=int(rng.integers(12, 18)),
         )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from far_app.errors import ConfigError
 from far_app.learning.critic import Critic
 from far_app.learning.dataset import Episode
 from far_app.learning.policy import DiffusionPolicy
-from far_app.learning.train_policy import segment_features
+from far_app.learning.segments import segment_features
 from far_app.learning.transitions import EncodedEpisode, RewardKind, Transitions, joined, transitions
 
 Batch = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]

@@ -1,0 +1,92 @@
+"""Batches of consecutive ticks from demonstrations, and their features with every frame encoded once.
+
+Two histories that share a frame share its features, so a light encoder sees five frames for four histories instead of
+eight. Pictures are padded once and cropped anew for each segment: the random shift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from far_app.errors import ConfigError
+from far_app.learning.dataset import Episode
+from far_app.learning.policy import DiffusionPolicy, PolicyConfig
+
+Segments = tuple[dict[str, Tensor], Tensor, Tensor, Tensor | None]
+
+
+class DemonstrationArrays:
+    """All demonstrations in memory, pictures padded for random shifts, addressed by (episode, tick)."""
+
+    def __init__(self, episodes: Sequence[Episode], config: PolicyConfig, shift: int) -> None:
+        if not episodes:
+            raise ConfigError("no demonstrations to train on; make some with `far demo`")
+        self.config, self.shift = config, shift
+        self.lengths = np.array([len(e) for e in episodes])
+        self.starts = np.concatenate([[0], np.cumsum(self.lengths)[:-1]])
+        pad = ((0, 0), (shift, shift), (shift, shift), (0, 0))
+        self.images = {
+            c: np.concatenate([np.pad(e.images[c], pad, mode="edge") for e in episodes]) for c in config.cameras
+        }
+        self.states = np.concatenate([e.states for e in episodes])
+        self.actions = np.concatenate([e.actions for e in episodes])
+        self.offsets = object_offsets(episodes)
+        self.ends = np.repeat(self.starts + self.lengths - 1, self.lengths)
+        """Row of the last tick of each row's episode."""
+
+    def segments(self, count: int, length: int, rng: np.random.Generator) -> Segments:
+        """`count` segments of `length` ticks: frames (count, length + n_obs − 1, S, S, 3), states, chunks
+        (count, length, H, A), object offsets (count, length, K). Ticks before an episode's first repeat it, actions
+        past its last repeat it."""
+        n_obs, horizon, size = self.config.n_obs, self.config.horizon, self.config.image_size
+        rows = rng.integers(0, len(self.ends), count)
+        first = np.searchsorted(self.starts, rows, side="right") - 1
+        start = np.minimum(rows, np.maximum(self.ends[rows] - length + 1, self.starts[first]))
+        span = np.arange(-(n_obs - 1), length)
+        frames = np.clip(start[:, None] + span, self.starts[first][:, None], self.ends[rows][:, None])
+        offsets = rng.integers(0, 2 * self.shift + 1, (count, 2))
+        images = {c: torch.from_numpy(self._cropped(a, frames, offsets, size)) for c, a in self.images.items()}
+        ticks = frames[:, n_obs - 1 :]
+        index = np.minimum(ticks[..., None] + np.arange(horizon), self.ends[rows][:, None, None])
+        located = None if self.offsets is None else torch.from_numpy(self.offsets[ticks])
+        return images, torch.from_numpy(self.states[frames]), torch.from_numpy(self.actions[index]), located
+
+    @staticmethod
+    def _cropped(array: np.ndarray, frames: np.ndarray, offsets: np.ndarray, size: int) -> np.ndarray:
+        out = np.empty((*frames.shape, size, size, 3), np.uint8)
+        for i, (dy, dx) in enumerate(offsets):
+            out[i] = array[frames[i], dy : dy + size, dx : dx + size]
+        return out
+
+
+def object_offsets(episodes: Sequence[Episode]) -> np.ndarray | None:
+    """Object positions relative to the hand in units of 10 cm, (N, 3 · objects); None where they are not known."""
+    if any(e.objects is None for e in episodes):
+        return None
+    parts = [
+        e.objects.reshape(len(e), -1, 7)[:, :, :3] - e.states[:, None, :3] for e in episodes if e.objects is not None
+    ]
+    return (np.concatenate(parts).reshape(sum(map(len, parts)), -1) * 10.0).astype(np.float32)
+
+
+def segment_features(policy: DiffusionPolicy, images: dict[str, Tensor], states: Tensor) -> Tensor:
+    """Features of every history in a batch of segments, (count · length, F); each frame is encoded once where the
+    encoder shares its weights over the frames."""
+    encoder, n_obs = policy.encoder, policy.config.n_obs
+    count, frames = states.shape[:2]
+    length = frames - n_obs + 1
+    normalised = policy.normalizer(states)
+    windows = [slice(t, t + length) for t in range(n_obs)]
+    state = torch.stack([normalised[:, w].flatten(0, 1) for w in windows], dim=1)
+    if encoder.per_frame:
+        parts = [[encoder.camera_features(c, t, images[c][:, w].flatten(0, 1)) for c in encoder.camera_names]
+                 for t, w in enumerate(windows)]  # fmt: skip
+    else:
+        once = {c: encoder.camera_features(c, 0, images[c].flatten(0, 1)).unflatten(0, (count, frames))
+                for c in encoder.camera_names}  # fmt: skip
+        parts = [[once[c][:, w].flatten(0, 1) for c in encoder.camera_names] for w in windows]
+    return encoder.join(parts, state)
