@@ -27,6 +27,8 @@ SILENCE = 1.0
 """Seconds without an observation after which the robot counts as lost."""
 REQUEST_TIMEOUT = 1.0
 RESET_TIMEOUT = 10.0
+LAST_CHANCE = 0.1
+"""Seconds given to this process's own reading thread, which may have been starved too, before the robot is lost."""
 POLL = 0.1
 """Seconds between looks at whether the link was closed."""
 
@@ -109,8 +111,10 @@ class RemoteRobot:
     def observe(self) -> Observation:
         """The newest; each acknowledgment is handed out once."""
         with self._news:
+            if not self._closed and self.silence() > SILENCE:
+                self._news.wait(LAST_CHANCE)
             newest, reply = self._newest, self._reply
-            silence = time.monotonic() - self._heard
+            silence = self.silence()
             if self._closed or newest is None or silence > SILENCE:
                 raise RobotError(
                     f"no observation from the hw server for {silence:.1f} s (limit {SILENCE} s): it died, hangs or "

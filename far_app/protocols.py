@@ -50,8 +50,8 @@ class Robot(Protocol):
     """An arm with its cameras, real or twin, near or behind a socket."""
 
     def observe(self) -> Observation:
-        """The newest observation; blocks at most a few ms (never for a new one). Raises RobotError when none came
-        for a second."""
+        """The newest observation; blocks at most a few ms (never for a new one). Acknowledgments are handed out once:
+        observe from one place. Raises RobotError when none came for a second."""
         ...
 
     def send(self, target: Target) -> None:
@@ -157,6 +157,10 @@ class Planner(Protocol):
         ...
 
 
+Progress = Callable[[AdaptationStep | Adaptation], None]
+"""Hears of each gradient step, and of the adaptation as far as it is known (attribution, then pairs)."""
+
+
 @runtime_checkable
 class Method(Protocol):
     """How to retry: nr, far, bgr … A trial calls begin once, adapt after each failure that has a retry left."""
@@ -173,7 +177,7 @@ class Method(Protocol):
         self,
         attempt: Attempt,
         cancelled: Callable[[], bool],
-        progress: Callable[[AdaptationStep], None],
+        progress: Progress,
     ) -> Adaptation:
         """Learn from a failed attempt. Runs in a background thread; looks at `cancelled` between batches."""
         ...

@@ -27,6 +27,8 @@ log = logging.getLogger(__name__)
 
 RE_ANCHOR = 0.5
 """Lateness, as a share of a servo period, from which the schedule starts anew instead of catching up."""
+YIELD = 0.0005
+"""Seconds given to others at each re-anchoring: a plant too slow for its rate must not take a core for itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +140,8 @@ class ServoThread:
             self.ticks += 1
             if now - deadline > RE_ANCHOR * period:
                 self.re_anchored += 1
-                deadline = now
+                time.sleep(YIELD)
+                deadline = now = time.monotonic()
             deadline += period
             self._tick(now)
             if not self._calls.empty():
