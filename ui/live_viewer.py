@@ -40,7 +40,7 @@ class LiveViewer:
         if self._process.poll() is None:
             self._process.terminate()
             try:
-                self._process.wait(timeout=3)
+                self._process.wait(timeout=1)
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()

@@ -32,6 +32,8 @@ class RawClient:
             compression=None,
         )
         self.widgets: dict[str, dict[str, Any]] = {}
+        self.nodes: set[str] = set()
+        """Names in the 3D scene."""
         self.windows = 0
         self.bytes = 0
 
@@ -57,6 +59,8 @@ class RawClient:
         window = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(raw[16 : 16 + size]))
         for message in window["messages"]:
             if "uuid" not in message:
+                if "props" in message and "name" in message:
+                    self.nodes.add(message["name"])
                 continue
             if "props" in message:
                 self.widgets[message["uuid"]] = {"type": message["type"], **message["props"]}

@@ -9,6 +9,7 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
+from far_app.session_states import State
 from far_app.telemetry import BodyMesh, SceneGeometry, Telemetry
 from ui.plot_model import flagged_ticks
 
@@ -93,20 +94,19 @@ class Scene3D:
         else:
             self._path.points, self._path.colors, self._path.visible = segments, colors, True
 
-    def trail(self, telemetry: Telemetry) -> None:
-        """Where the hand has been in this attempt; after a failure the flagged chunks' parts turn red."""
+    def follow(self, telemetry: Telemetry) -> None:
+        """Remember where the hand is in this attempt."""
         attempt = (telemetry.trial, telemetry.attempt)
         if attempt != self._attempt:
             self._attempt, self._trail = attempt, []
-        eef = telemetry.eef
-        if (
-            eef is not None
-            and telemetry.state == "running"
-            and (not self._trail or telemetry.tick > self._trail[-1][0])
-        ):
+        eef, running = telemetry.eef, telemetry.state is State.RUNNING
+        if eef is not None and running and (not self._trail or telemetry.tick > self._trail[-1][0]):
             self._trail.append((telemetry.tick, np.array(eef.position, dtype=np.float32)))
             del self._trail[:-TRAIL_LIMIT]
-        key = (attempt, len(self._trail), telemetry.flagged)
+
+    def trail(self, telemetry: Telemetry) -> None:
+        """Where the hand has been; after a failure the flagged chunks' parts turn red."""
+        key = (self._attempt, len(self._trail), telemetry.flagged)
         if key == self._trail_key:
             return
         self._trail_key = key

@@ -76,6 +76,7 @@ class Page:
         self._console = Console(self._server, self._stop_line, self._latest, scene3d=options.scene3d)
         self._viewer = LiveViewer(options.run_folder, options.recordings) if options.rerun else None
         self._pictures, self._plots, self._texts, self._beats = Every(1 / 12), Every(1 / 5), Every(1 / 5), Every(1 / 2)
+        self._trails = Every(1 / 5)
         self._hw_seq = 0
 
     def _latest(self) -> tuple[Telemetry | None, Freshness]:
@@ -102,7 +103,9 @@ class Page:
                     self._console.plots(telemetry)
                 if self._console.scene is not None:
                     self._console.scene.chunk(telemetry)
-                    self._console.scene.trail(telemetry)
+                    self._console.scene.follow(telemetry)
+                    if self._trails(now):
+                        self._console.scene.trail(telemetry)
 
     def _show_view(self, now: float) -> None:
         scene = self._console.scene

@@ -78,7 +78,7 @@ WORDS: dict[State, tuple[str, Tone]] = {
 def banner(telemetry: Telemetry | None, fresh: Freshness) -> Banner:
     """State, where in the session we are, and one sentence why."""
     if telemetry is None:
-        return Banner(word="WAITING", tone=Tone.WARN, detail="No word from the app yet.")
+        return Banner(word="WAITING", tone=Tone.WARN, detail="No word from the app yet: it is starting, or gone.")
     word, tone = WORDS[telemetry.state]
     detail = _detail(telemetry)
     if telemetry.state is State.TRIAL_DONE and telemetry.history:
@@ -153,7 +153,9 @@ def control(intent: Intent, telemetry: Telemetry | None, fresh: Freshness) -> Co
     """Whether a button applies now. STOP always does."""
     if intent is Intent.STOP:
         return Control(enabled=True)
-    if telemetry is None or fresh.app_silent:
+    if telemetry is None:
+        return Control(enabled=False, reason="waiting for the app")
+    if fresh.app_silent:
         return Control(enabled=False, reason="the app is silent")
     if intent in telemetry.allowed:
         return Control(enabled=True)

@@ -6,10 +6,11 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from conftest import PageProcess, wait_until
+from ui_process import PageProcess, free_port, wait_until
 from ui_stage import Stage, adapting, running, stopped
 
 from far_app.session_states import Intent, State
@@ -40,49 +41,72 @@ def browser() -> Iterator[Any]:
         chromium.close()
 
 
+@pytest.fixture(scope="module")
+def opened(browser: Any) -> Iterator[tuple[Any, Stage]]:
+    """One ui process, one open page and its test source for most tests of this file; requests are recorded."""
+    with TemporaryDirectory(prefix="far") as name:
+        source = Stage(Path(name))
+        process = PageProcess(Path(name), free_port())
+        page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page.requests = []
+        page.on("request", lambda request: page.requests.append(request.url))
+        page.goto(process.url)
+        page.wait_for_selector("#op-state[data-state='RUNNING']", timeout=60_000)
+        yield page, source
+        page.close()
+        process.kill()
+        source.close()
+
+
 @pytest.fixture
-def tab(browser: Any, start_page: Start, stage: Stage) -> Iterator[Any]:
-    """An open page that shows the test source's running attempt; requests that leave the machine are recorded."""
-    process = start_page()
-    page = browser.new_page(viewport={"width": 1280, "height": 720})
-    page.requests = []
-    page.on("request", lambda request: page.requests.append(request.url))
-    page.goto(process.url)
-    page.wait_for_selector("#op-state[data-state='RUNNING']", timeout=30_000)
-    yield page
-    page.close()
+def tab(opened: tuple[Any, Stage], source: Stage) -> Any:
+    """The open page, back at a first attempt under way."""
+    page = opened[0]
+    page.evaluate("document.activeElement.blur()")
+    page.wait_for_selector("#op-state[data-state='RUNNING'][data-tick='87']")
+    page.wait_for_selector("#op-stop:has-text('space key')")
+    return page
+
+
+@pytest.fixture
+def source(opened: tuple[Any, Stage]) -> Stage:
+    stage = opened[1]
+    stage.telemetry, stage.mode = running(), RobotMode.TRACKING
+    stage.intents.clear()
+    stage.stops.clear()
+    return stage
 
 
 def button(page: Any, label: str) -> Any:
     return page.get_by_role("button", name=re.compile(f"^{label}"))
 
 
-def test_the_state_is_shown_and_followed(tab: Any, stage: Stage) -> None:
-    stage.telemetry = adapting()
+def test_the_state_is_shown_and_followed(tab: Any, source: Stage) -> None:
+    source.telemetry = adapting()
     tab.wait_for_selector("#op-state[data-state='LEARNING'][data-attempt='2']")
     assert "6 of 10" in tab.inner_text("#op-adapt")
     assert "not solved" in tab.inner_text("#op-history")
-    stage.telemetry = running(12, 3)
+    source.telemetry = running(12, 3)
     tab.wait_for_selector("#op-state[data-state='RUNNING'][data-attempt='3'][data-tick='12']")
 
 
-def test_stop_latches_by_click_and_by_space(tab: Any, stage: Stage) -> None:
+def test_stop_latches_by_click_and_by_space(tab: Any, source: Stage) -> None:
     button(tab, "STOP").click()
-    assert wait_until(lambda: len(stage.stops) == 1)
+    assert wait_until(lambda: len(source.stops) == 1)
     tab.wait_for_selector("#op-stop:has-text('latched in')")
     tab.keyboard.press("Space")
-    assert wait_until(lambda: len(stage.stops) >= 2)
-    assert stage.stops[-1].source == "page: space key"
+    assert wait_until(lambda: len(source.stops) >= 2)
+    assert source.stops[-1].source == "page: space key"
 
 
-def test_space_stops_and_does_not_press_the_focused_button(tab: Any, stage: Stage) -> None:
+def test_space_stops_and_does_not_press_the_focused_button(tab: Any, source: Stage) -> None:
     pause = button(tab, "Pause")
     pause.click()
-    assert wait_until(lambda: [i.intent for i in stage.intents] == [Intent.PAUSE])
+    assert wait_until(lambda: [i.intent for i in source.intents] == [Intent.PAUSE])
     tab.keyboard.press("Space")
-    assert wait_until(lambda: len(stage.stops) == 1)
+    assert wait_until(lambda: len(source.stops) == 1)
     tab.wait_for_selector("#op-stop:has-text('latched in')")
-    assert [i.intent for i in stage.intents if i.intent is not Intent.STOP] == [Intent.PAUSE]
+    assert [i.intent for i in source.intents if i.intent is not Intent.STOP] == [Intent.PAUSE]
 
 
 @pytest.mark.parametrize(
@@ -96,36 +120,36 @@ def test_space_stops_and_does_not_press_the_focused_button(tab: Any, stage: Stag
     ],
 )
 def test_every_live_control_sends_its_intent(
-    tab: Any, stage: Stage, label: str, key: str | None, intent: Intent
+    tab: Any, source: Stage, label: str, key: str | None, intent: Intent
 ) -> None:
     button(tab, label).click()
-    assert wait_until(lambda: [i.intent for i in stage.intents] == [intent])
+    assert wait_until(lambda: [i.intent for i in source.intents] == [intent])
     if key is not None:
         tab.keyboard.press(key)
-        assert wait_until(lambda: [i.intent for i in stage.intents] == [intent, intent])
+        assert wait_until(lambda: [i.intent for i in source.intents] == [intent, intent])
 
 
-def test_dead_controls_are_disabled_and_say_why(tab: Any, stage: Stage) -> None:
+def test_dead_controls_are_disabled_and_say_why(tab: Any, source: Stage) -> None:
     assert button(tab, "Resume").is_disabled()
     assert "nothing is held" in button(tab, "Resume").inner_text()
-    stage.telemetry = stopped()
+    source.telemetry = stopped()
     tab.wait_for_selector("#op-state[data-state='STOPPED']")
     assert button(tab, "Mark success").is_disabled()
     assert "Resume first" in button(tab, "Mark success").inner_text()
     button(tab, "Resume").click()
-    assert wait_until(lambda: [i.intent for i in stage.intents] == [Intent.RESUME])
+    assert wait_until(lambda: [i.intent for i in source.intents] == [Intent.RESUME])
 
 
-def test_after_a_stop_resume_takes_a_click_not_a_stray_key(tab: Any, stage: Stage) -> None:
-    stage.telemetry = stopped()
+def test_after_a_stop_resume_takes_a_click_not_a_stray_key(tab: Any, source: Stage) -> None:
+    source.telemetry = stopped()
     tab.wait_for_selector("#op-state[data-state='STOPPED']")
     tab.keyboard.press("r")
     tab.wait_for_selector("#op-loop:has-text('click it')")
-    assert stage.intents == []
-    stage.telemetry = replace(running(), state=State.PAUSED, allowed=(Intent.RESUME,))
+    assert source.intents == []
+    source.telemetry = replace(running(), state=State.PAUSED, allowed=(Intent.RESUME,))
     tab.wait_for_selector("#op-state[data-state='PAUSED']")
     tab.keyboard.press("r")
-    assert wait_until(lambda: [i.intent for i in stage.intents] == [Intent.RESUME])
+    assert wait_until(lambda: [i.intent for i in source.intents] == [Intent.RESUME])
 
 
 def test_the_overlay_rises_when_the_ui_process_dies_and_falls_when_it_returns(
@@ -148,17 +172,17 @@ def test_the_overlay_rises_when_the_ui_process_dies_and_falls_when_it_returns(
     page.close()
 
 
-def test_the_overlay_names_a_silent_app(tab: Any, stage: Stage) -> None:
-    stage.telemetry = None
+def test_the_overlay_names_a_silent_app(tab: Any, source: Stage) -> None:
+    source.telemetry = None
     tab.wait_for_selector("#op-state[data-state='APP SILENT']")
     tab.wait_for_selector("#op-dead.now:has-text('APP SILENT')")
     assert button(tab, "Pause").is_disabled()
     button(tab, "STOP").click()
-    assert wait_until(lambda: len(stage.stops) == 1)
+    assert wait_until(lambda: len(source.stops) == 1)
 
 
-def test_flagged_chunks_are_shaded_in_the_value_plot(tab: Any, stage: Stage) -> None:
-    stage.telemetry = adapting()
+def test_flagged_chunks_are_shaded_in_the_value_plot(tab: Any, source: Stage) -> None:
+    source.telemetry = adapting()
     tab.wait_for_selector("#op-state[data-state='LEARNING']")
     script = """() => Object.values(window.__viserTestpoints.uplots).map(u =>
         ({data: u.chart.data.map(a => Array.from(a)), x: [u.chart.scales.x.min, u.chart.scales.x.max],
@@ -188,8 +212,8 @@ def test_the_page_asks_nothing_of_the_outside(tab: Any) -> None:
 
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 720), (1920, 1080), (1024, 768), (1600, 1200)])
-def test_nothing_is_clipped_or_covered(tab: Any, stage: Stage, width: int, height: int) -> None:
-    stage.telemetry = adapting()
+def test_nothing_is_clipped_or_covered(tab: Any, source: Stage, width: int, height: int) -> None:
+    source.telemetry = adapting()
     tab.set_viewport_size({"width": width, "height": height})
     tab.wait_for_selector("#op-state[data-state='LEARNING']")
     tab.wait_for_timeout(500)
@@ -212,13 +236,13 @@ def test_nothing_is_clipped_or_covered(tab: Any, stage: Stage, width: int, heigh
             assert across <= 1 or down <= 1, (a[4], b[4])
 
 
-def test_a_second_browser_that_comes_late_sees_everything(tab: Any, browser: Any, stage: Stage) -> None:
-    stage.telemetry = adapting()
+def test_a_second_browser_that_comes_late_sees_everything(tab: Any, browser: Any, source: Stage) -> None:
+    source.telemetry = adapting()
     tab.wait_for_selector("#op-state[data-state='LEARNING']")
     late = browser.new_page(viewport={"width": 1280, "height": 720})
     late.goto(tab.url)
     late.wait_for_selector("#op-state[data-state='LEARNING']", timeout=30_000)
     assert "6 of 10" in late.inner_text("#op-adapt")
     late.close()
-    stage.mode = RobotMode.HOMING
+    source.mode = RobotMode.HOMING
     tab.wait_for_selector("#op-state:has-text('arm goes home')")

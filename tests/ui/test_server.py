@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from conftest import PageProcess, wait_until
+from ui_process import PageProcess, wait_until
 from ui_stage import Stage, running, stopped
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
