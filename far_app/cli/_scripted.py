@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from far_app.errors import ConfigError
-from far_app.protocols import History, Policy, PolicySpec
+from far_app.protocols import History, Policy, PolicySpec, Progress
 from far_app.session.adaptation import unchanged
-from far_app.types import ACTION_DIM, ActionChunk, Adaptation, AdaptationStep, Attempt
+from far_app.types import ACTION_DIM, ActionChunk, Adaptation, Attempt
 
 HORIZON = 8
 
@@ -61,9 +61,7 @@ class ScriptedMethod:
 
     def begin(self, scene_seed: int) -> None: ...
 
-    def adapt(
-        self, attempt: Attempt, cancelled: Callable[[], bool], progress: Callable[[AdaptationStep], None]
-    ) -> Adaptation:
+    def adapt(self, attempt: Attempt, cancelled: Callable[[], bool], progress: Progress) -> Adaptation:
         return unchanged(self.policy.version, "none")
 
     def perturb(self, attempt_index: int, scene_seed: int) -> Callable[[int], np.ndarray]:

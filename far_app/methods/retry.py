@@ -31,7 +31,7 @@ from far_app.learning.trainable import trainable
 from far_app.methods import evidence
 from far_app.methods.evidence import recorded_values, sent_chunks, values
 from far_app.perturbation import Perturbation, perturbation
-from far_app.protocols import Policy
+from far_app.protocols import Policy, Progress
 from far_app.seeding import generator
 from far_app.types import Adaptation, AdaptationStep, Attempt
 
@@ -82,7 +82,7 @@ class RetryMethod:
             self._scene = scene_seed
             self._restore()
 
-    def adapt(self, attempt: Attempt, cancelled: Cancelled, progress: Callable[[AdaptationStep], None]) -> Adaptation:
+    def adapt(self, attempt: Attempt, cancelled: Cancelled, progress: Progress) -> Adaptation:
         trial, version = self._trial, self.policy.version
         outdated: Cancelled = lambda: cancelled() or self._trial != trial  # noqa: E731
         horizon = self.policy.spec.horizon
@@ -150,7 +150,7 @@ class _Learning:
             self._last = now
         self.adaptation = replace(self.adaptation, seconds=seconds, **changes)
 
-    def run(self, progress: Callable[[AdaptationStep], None]) -> tuple[nn.Module | None, Pairs]:
+    def run(self, progress: Progress) -> tuple[nn.Module | None, Pairs]:
         """The adapted denoiser (None when nothing changed) and the pairs it learnt from."""
         method, config = self.method, self.method.config
         critic = method.critic
@@ -159,8 +159,10 @@ class _Learning:
         changes = value_change(found, method.policy.spec.horizon)
         flags = flag(changes, config.attribution)
         self.note("attribution", values=found, value_changes=changes, threshold=flags.threshold, flagged=flags.ticks)
+        progress(self.adaptation)
         pairs = self._trajectory(critic) if config.fcpa.objective == "awr" else self._pairs(critic, flags.ticks)
         self.note("pairs", pairs=len(pairs), empty_states=pairs.empty_states)
+        progress(self.adaptation)
         if not len(pairs):
             self.note(status="empty", note="no chunk could be paired")
             return None, pairs

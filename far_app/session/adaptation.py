@@ -24,6 +24,8 @@ class BackgroundAdaptation:
 
     def __init__(self, method: Method, attempt: Attempt, limit: float) -> None:
         self.progress: list[AdaptationStep] = []
+        self.known: Adaptation | None = None
+        """What is known so far: attribution, then pairs, then all."""
         self._base_version = method.policy.version
         self._deadline = time.monotonic() + limit
         self._limit = limit
@@ -63,10 +65,17 @@ class BackgroundAdaptation:
     def _work(self, method: Method, attempt: Attempt) -> None:
         set_niceness(BACKGROUND_NICENESS)
         try:
-            self._adaptation = method.adapt(attempt, self._cancelled.is_set, self.progress.append)
+            self._adaptation = method.adapt(attempt, self._cancelled.is_set, self._hear)
         except Exception as error:
             log.exception("the adaptation failed; the previous policy version retries")
             self._adaptation = unchanged(self._base_version, "failed", f"{type(error).__name__}: {error}")
+        self.known = self._adaptation
+
+    def _hear(self, news: AdaptationStep | Adaptation) -> None:
+        if isinstance(news, Adaptation):
+            self.known = news
+        else:
+            self.progress.append(news)
 
 
 def unchanged(version: str, status: str, note: str = "") -> Adaptation:

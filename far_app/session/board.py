@@ -28,7 +28,10 @@ class Board:
         self._values: list[float] = []
         self._step: Step | None = None
         self._chunk: ActionChunk | None = None
-        self._adaptation: Adaptation | None = None
+        self._curve: Adaptation | None = None
+        """The failed attempt's values and flags, while they are on show."""
+        self._latest: Adaptation | None = None
+        """The running or latest adaptation of the trial."""
         self._began = time.monotonic()
         self.reason = ""
         self.refusal = ""
@@ -43,6 +46,7 @@ class Board:
     def trial_started(self, trial: int, scene_seed: int) -> None:
         self.trial, self.scene_seed, self.attempt = trial, scene_seed, 1
         self._began = time.monotonic()
+        self._latest, self.adaptation_steps = None, ()
         self._clear()
 
     def attempt_started(self, attempt: int, policy_version: str) -> None:
@@ -59,8 +63,16 @@ class Board:
         if 0 <= chunk.tick < len(self._values):
             self._values[chunk.tick] = chunk.value
 
+    def adaptation_started(self) -> None:
+        self.adapting, self._latest, self.adaptation_steps = True, None, ()
+
+    def attributed(self, known: Adaptation | None) -> None:
+        """What a running adaptation knows so far."""
+        if self.adapting and known is not None:
+            self._curve = self._latest = known
+
     def adapted(self, adaptation: Adaptation) -> None:
-        self.adapting, self._adaptation = False, adaptation
+        self.adapting, self._latest = False, adaptation
         self.adaptation_steps = adaptation.history or self.adaptation_steps
 
     def trial_ended(self, trial: Trial, judged_by: str, note: str) -> None:
@@ -74,20 +86,21 @@ class Board:
 
     def telemetry(self, state: State, newest: Observation | None) -> Telemetry:
         """A snapshot; sequence number, stamp and loop health are the publisher's."""
-        adaptation, step = self._adaptation, self._step
-        values = adaptation.values if adaptation is not None and len(adaptation.values) else self._values
-        status = "attribution" if self.adapting and not self.adaptation_steps else "update" if self.adapting else ""
+        curve, latest, step = self._curve, self._latest, self._step
+        values = curve.values if curve is not None and len(curve.values) else self._values
+        status = latest.status if latest else ""
+        if self.adapting and status in ("", "none"):
+            status = "update" if self.adaptation_steps else "attribution" if latest is None else "candidates"
         return Telemetry(
             seq=0, stamp=0.0, state=state, reason=self.reason, session=self._session, task=self._task.name,
             method=self._method, policy_version=self.policy_version, trial=self.trial, trials=self._trials,
             attempt=self.attempt, max_attempts=self._task.max_attempts, scene_seed=self.scene_seed,
             tick=len(self._values), horizon=self._task.horizon, rate=self._task.rate, chunk_horizon=self._chunk_horizon,
             values=np.array(values, dtype=float),
-            value_changes=adaptation.value_changes if adaptation else np.zeros(0),
-            threshold=adaptation.threshold if adaptation else float("nan"),
-            flagged=adaptation.flagged if adaptation else (),
-            adaptation=self.adaptation_steps, adaptation_status=status or (adaptation.status if adaptation else ""),
-            pairs=adaptation.pairs if adaptation else 0,
+            value_changes=curve.value_changes if curve else np.zeros(0),
+            threshold=curve.threshold if curve else float("nan"), flagged=curve.flagged if curve else (),
+            adaptation=self.adaptation_steps, adaptation_status=status,
+            pairs=latest.pairs if latest else 0,
             homing_progress=newest.status.homing_progress if newest else 0.0,
             robot=newest.status if newest else None, joints=newest.joints if newest else np.zeros(0),
             eef=newest.eef if newest else None, gripper=newest.gripper if newest else 0.0,
@@ -103,5 +116,5 @@ class Board:
 
     def _clear(self) -> None:
         self._values = []
-        self._step = self._chunk = self._adaptation = None
-        self.adaptation_steps, self.adapting = (), False
+        self._step = self._chunk = self._curve = None
+        self.adapting = False

@@ -272,7 +272,7 @@ class Session:
             return FinishedAdaptation(unchanged(method.policy.version, "none", attempt.outcome.note))
         self._end_adaptation()
         self._reported = 0
-        self.board.adapting = True
+        self.board.adaptation_started()
         self._adaptation = BackgroundAdaptation(method, attempt, self.settings.adaptation_limit)
         return self._adaptation
 
@@ -281,6 +281,8 @@ class Session:
         for chunk in self.planner.handed_out():
             self.board.planned(chunk)
             self.recorder.add_chunk(chunk)
+        if self._adaptation is not None:
+            self.board.attributed(self._adaptation.known)
         if self._adaptation is not None and len(self._adaptation.progress) > self._reported:
             steps = tuple(self._adaptation.progress)
             for step in steps[self._reported :]:

@@ -79,8 +79,8 @@ def test_an_adaptation_reports_its_evidence():
     m = made("far")
     m.begin(5)
     attempt = small_attempt(ticks=40)
-    steps = []
-    adaptation = m.adapt(attempt, lambda: False, steps.append)
+    news = []
+    adaptation = m.adapt(attempt, lambda: False, news.append)
     assert len(adaptation.values) == 41
     assert np.isfinite(adaptation.values).all()
     assert [s.value for s in attempt.steps] == adaptation.values[:40].tolist()
@@ -88,6 +88,9 @@ def test_an_adaptation_reports_its_evidence():
     assert len(adaptation.flagged) == 4
     assert all(adaptation.value_changes[t] <= adaptation.threshold for t in adaptation.flagged)
     assert adaptation.pairs == 12
+    attributed, paired, *steps = news
+    assert (attributed.flagged, attributed.pairs) == (adaptation.flagged, 0), "flags are told before pairs are sought"
+    assert (paired.flagged, paired.pairs) == (adaptation.flagged, 12)
     assert tuple(steps) == adaptation.history
     assert set(adaptation.seconds) == {"attribution", "encoding", "candidates", "pairs", "update"}
 

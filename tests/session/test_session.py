@@ -12,6 +12,7 @@ import pytest
 from far_app.detectors import TwinCheck
 from far_app.motion import ActionScale
 from far_app.protocols import Hold, Home, Resume
+from far_app.session.adaptation import unchanged
 from far_app.session.inbox import IntentInbox
 from far_app.session.planners import ThreadedPlanner
 from far_app.session.recorder import Recorder
@@ -36,7 +37,7 @@ class Desk:
         self.session = Session(
             settings=SessionSettings(**settings), robot=self.robot, planner=ThreadedPlanner(), method=self.method,
             detector=TwinCheck(2), scale=ActionScale(), recorder=Recorder(), inbox=self.inbox,
-            task=replace(task("lift"), horizon=horizon, max_attempts=attempts, rate=100.0), statistics=self.statistics,
+            task=replace(task("lift"), horizon=horizon, max_attempts=attempts, rate=50.0), statistics=self.statistics,
         )  # fmt: skip
 
     @property
@@ -66,8 +67,9 @@ def test_a_trial_succeeds_with_no_button_and_the_arm_is_held_at_the_end():
     assert (result.seed, result.attempts, result.success, result.judged_by) == (5, 1, True, "twin")
     assert desk.state is State.FINISHED
     assert isinstance(desk.robot.requests[-1], Hold)
-    assert desk.statistics.starved == 0 and desk.statistics.ticks == len(desk.robot.targets) > 10
+    assert desk.statistics.ticks >= len(desk.robot.targets) > 10
     assert len(desk.statistics.late) >= desk.statistics.ticks - 1
+    assert not desk.session._attempts[0].steps[0].starved, "the first chunk is there before the first tick"
 
 
 def test_a_failure_is_adapted_from_in_the_background_and_the_retry_runs_the_new_version():
@@ -81,12 +83,13 @@ def test_a_failure_is_adapted_from_in_the_background_and_the_retry_runs_the_new_
 
 
 def test_a_slow_policy_never_blocks_a_tick():
-    desk = Desk(policy=Forward(speed=0.25, seconds=0.03), horizon=60)
-    (result,) = desk.session.run()
-    assert result.success
+    desk = Desk(policy=Forward(speed=0.1, seconds=0.07), horizon=40, attempts=1)
+    desk.session.run()
     steps = desk.session._attempts[0].steps
-    assert all(not s.starved for s in steps), "the newest valid plan continues"
-    assert max(s.tick - s.chunk_tick for s in steps) >= 3
+    assert len(steps) == 40
+    assert sum(s.tick - s.chunk_tick >= 3 for s in steps) > 20, "the newest valid plan continues"
+    deadlines = np.diff([s.deadline for s in steps])
+    assert np.median(deadlines) < 0.03, "ticks go on at their own pace"
 
 
 def test_an_adaptation_over_its_limit_is_cancelled_and_the_previous_version_retries():
@@ -184,7 +187,7 @@ def test_skip_ends_the_trial_without_a_retry():
 
 
 def test_observations_stale_for_a_moment_hold_the_arm_and_motion_resumes_by_itself():
-    desk = Desk(policy=Forward(speed=0.1), horizon=60, attempts=1)
+    desk = Desk(policy=Forward(speed=0.01), horizon=150, attempts=1)
 
     def stall():
         desk.robot.freeze_stamp = time.monotonic()
@@ -212,7 +215,12 @@ def test_trouble_is_a_fault_that_ends_a_headless_session_with_an_error(trouble):
             desk.robot.latch("arm error C31: collision", fault=True)
 
     desk.when(desk.moving, strike)
-    message = {"stale": "observations were stale", "silent": "hardware server", "arm": "C31", "nan": "non-finite action"}
+    message = {
+        "stale": "observations were stale",
+        "silent": "hardware server",
+        "arm": "C31",
+        "nan": "non-finite action",
+    }
     with pytest.raises(SessionFault, match=message[trouble]):
         desk.session.run()
     (attempt,) = desk.session._attempts
@@ -228,3 +236,23 @@ def test_an_operator_clears_a_fault_and_the_trial_goes_on():
     (result,) = desk.session.run()
     assert result.success and result.attempts == 2
     assert desk.method.adapted_attempts == [1], "an arm fault is a failure to learn from"
+
+
+def test_the_page_sees_the_flags_while_the_arm_goes_home():
+    class Telling(Faster):
+        def adapt(self, attempt, cancelled, progress):
+            known = unchanged(self.policy.version, "none")
+            progress(replace(known, values=np.zeros(6), value_changes=np.array([0.0, -1.0]), flagged=(1,)))
+            time.sleep(0.2)
+            return replace(known, status="empty", flagged=(1,))
+
+    desk = Desk(policy=Forward(speed=0.01), horizon=5, attempts=2)
+    desk.session.method = desk.method = Telling(Forward(speed=0.01))
+    shown = []
+    desk.session.supervision.show = lambda: shown.append(desk.session.board.telemetry(desk.state, None))
+    desk.session.run()
+    adapting = [t for t in shown if t.state is State.ADAPTING]
+    assert any(t.flagged == (1,) and t.adaptation_status == "candidates" and len(t.values) == 6 for t in adapting)
+    retry = [t for t in shown if t.state is State.RUNNING and t.attempt == 2]
+    assert all(t.flagged == () for t in retry), "a new attempt starts with a clean curve"
+    assert all(t.adaptation_status == "empty" for t in retry), "what was learnt stays on show"
