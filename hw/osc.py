@@ -1,6 +1,6 @@
 """Operational-space impedance for the twin's arm (Khatib 1987), the law robosuite uses, in a tenth of the time.
 
-    τ = Jᵀ Λ (k_p e − k_d ẋ) + h + (I − Jᵀ J̄ᵀ) M (k_n (q₀ − q) − k_dn q̇),   Λ = (J M⁻¹ Jᵀ)⁻¹,  J̄ = M⁻¹ Jᵀ Λ
+    τ = Jᵀ Λ (k_p e − k_d ẋ) + h + (I − Jᵀ J̄ᵀ) M (k_n (q₀ − q) − k_dn q̇),   Λ = (J M⁻¹ Jᵀ + damping)⁻¹,  J̄ = M⁻¹ Jᵀ Λ
 
 e is the pose error in the world frame, h MuJoCo's bias force, q₀ the posture the elbow is drawn to.
 """
@@ -13,6 +13,10 @@ from jaxtyping import Float
 
 from far_app.motion import rotvec_from_quat
 from far_app.types import Pose
+
+
+DAMPING = 1e-2 * np.eye(6)
+"""Keeps Λ, and so the torques, finite where the arm is stretched out."""
 
 
 class OperationalSpace:
@@ -49,7 +53,7 @@ class OperationalSpace:
         self.J = self._jacobian[:, self.dofs]  # (6, 7)
         self.M = self._mass[np.ix_(self.dofs, self.dofs)]  # (7, 7)
         minv_jt = np.linalg.solve(self.M, self.J.T)  # (7, 6)
-        inertia = np.linalg.pinv(self.J @ minv_jt)  # Λ (6, 6)
+        inertia = np.linalg.inv(self.J @ minv_jt + DAMPING)  # Λ (6, 6)
         self.gain = self.J.T @ inertia  # (7, 6)
         self.nullspace = (np.eye(len(self.dofs)) - self.gain @ minv_jt.T) @ self.M  # (7, 7)
 

@@ -15,9 +15,11 @@ from tqdm import tqdm
 from far_app.cli.assemble import assemble, shipped
 from far_app.cli.lockstep_twin import lockstep_twin
 from far_app.config import RetryConfig
+from far_app.errors import RobotError
 from far_app.evaluation import DEV_SCENES, REPORT_SCENES, Arm, EvaluationPlan, Job, evaluate, read_results, run_scene
-from far_app.protocols import Method
+from far_app.protocols import Method, Resume
 from far_app.tasks import task as find_task
+from far_app.trial import Event
 from far_app.types import Trial
 
 log = logging.getLogger(__name__)
@@ -93,7 +95,7 @@ def work(job: Job) -> list[dict[str, Any]]:
     from far_app.detectors import TwinCheck
     from far_app.session.lockstep import adapt_at_once, run_lockstep
     from far_app.session.planners import LockstepPlanner
-    from far_app.trial import trial
+    from far_app.trial import Adapted, AttemptEnded, trial
 
     scene, done = job
     robot, task = _WORKER["robot"], _WORKER["task"]
@@ -102,6 +104,14 @@ def work(job: Job) -> list[dict[str, Any]]:
         events = trial(
             seed, robot, LockstepPlanner(), method, TwinCheck(task.success_ticks), task, robot.rig.scale, adapt_at_once
         )
-        return run_lockstep(events, robot.advance)
+        heard: list[Event] = []
+        try:
+            return run_lockstep(events, robot.advance, heard.append)
+        except RobotError as error:  # the arm latched (it could not get home, say): the trial ends as it stands
+            log.warning("scene %d, %s: %s", seed, method.name, error)
+            robot.request(Resume())
+            attempts = tuple(e.attempt for e in heard if isinstance(e, AttemptEnded))
+            adaptations = tuple(e.adaptation for e in heard if isinstance(e, Adapted))
+            return Trial(scene_seed=seed, attempts=attempts, adaptations=adaptations)
 
     return list(run_scene(scene, _WORKER["arms"], done, run))
