@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 
 from far_app.detectors import TwinCheck
+from far_app.errors import RecordingError
 from far_app.motion import ActionScale
 from far_app.protocols import Hold, Home, Resume
+from far_app.recording.inspect import inspect_session
+from far_app.recording.schema import SessionInfo
+from far_app.recording.writer import SessionWriter
 from far_app.session.adaptation import unchanged
 from far_app.session.inbox import IntentInbox
 from far_app.session.planners import ThreadedPlanner
@@ -256,3 +260,13 @@ def test_the_page_sees_the_flags_while_the_arm_goes_home():
     retry = [t for t in shown if t.state is State.RUNNING and t.attempt == 2]
     assert all(t.flagged == () for t in retry), "a new attempt starts with a clean curve"
     assert all(t.adaptation_status == "empty" for t in retry), "what was learnt stays on show"
+
+
+def test_a_full_disk_ends_the_session_with_the_arm_held_and_what_was_recorded_readable(tmp_path):
+    desk = Desk(policy=Forward(speed=0.01), horizon=10)
+    writer = SessionWriter(tmp_path, SessionInfo(task="lift", method="test"), space_to_start=0, space_to_go_on=10**18)
+    desk.session.recorder = desk.session.supervision.recorder = Recorder(writer)
+    with pytest.raises(RecordingError, match="free"):
+        desk.session.run()
+    assert isinstance(desk.robot.requests[-1], Hold)
+    assert inspect_session(writer.folder).state == "failed"
