@@ -14,7 +14,6 @@ from jaxtyping import Float
 from far_app.motion import rotvec_from_quat
 from far_app.types import Pose
 
-
 DAMPING = 1e-2 * np.eye(6)
 """Keeps Λ, and so the torques, finite where the arm is stretched out."""
 

@@ -66,7 +66,7 @@ class PolicyTraining:
 
 TRAININGS = {
     "paper": PolicyTraining(),
-    "quickstart": PolicyTraining(iterations=3_000, batch=64, draws=2, lr=5e-4, lr_end=2e-5),
+    "quickstart": PolicyTraining(iterations=2_000, batch=64, draws=2, lr=5e-4, lr_end=2e-5),
 }
 
 
