@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -151,9 +151,9 @@ class Planner(Protocol):
 
     def plan(
         self, history: History, tick: int, noise_key: tuple[int, int, int]
-    ) -> Generator[PlanRequest, ActionChunk, Sequence[ActionChunk]]:
-        """Hand over the tick's observations, return the chunks that became ready since the last call. Never waits
-        in real time."""
+    ) -> Generator[PlanRequest, Any, Sequence[ActionChunk]]:
+        """Hand over the tick's observations, return the chunks that became ready since the last call. A PlanRequest
+        that it yields is answered with its ActionChunk. Never waits in real time."""
         ...
 
 

@@ -148,6 +148,7 @@ def execute(
 
     for t in range(task.horizon + 1):
         deadline = yield Tick(phase="attempt", attempt_index=index, step=steps[-1] if steps else None)
+        assert isinstance(deadline, float), "a Tick is answered with its deadline"
         observation = robot.observe()
         if step is not None:
             steps.append(completed(step, observation, integrator))
@@ -161,13 +162,15 @@ def execute(
         history.extend([observation] * (spec.n_obs if not history else 1))
         for chunk in (yield from planner.plan(tuple(history), t, (scene_seed, index, t))):
             plan.add(chunk)
+            if chunk.tick < len(steps):  # V(s_k) of an earlier tick, computed in time for the record
+                steps[chunk.tick] = replace(steps[chunk.tick], value=chunk.value)
         action = plan.action(t)  # â_t = g(chunks)
         delta = perturbation(t) if action is not None else np.zeros(ACTION_DIM)  # δ_t
         commanded = np.clip(action + delta, -1.0, 1.0) if action is not None else hold_still(steps)
-        target = integrator.target(commanded, observation.eef, float(deadline))
+        target = integrator.target(commanded, observation.eef, deadline)
         robot.send(target)
         step = Step(
-            tick=t, seq=target.seq, stamp=observation.stamp, deadline=float(deadline), observation=observation,
+            tick=t, seq=target.seq, stamp=observation.stamp, deadline=deadline, observation=observation,
             action=action if action is not None else commanded, perturbation=delta, commanded=commanded,
             sent=np.full(ACTION_DIM, np.nan), chunk_tick=plan.newest_tick, starved=action is None,
             policy_version=method.policy.version, value=plan.value(t), reward=observation.reward,

@@ -7,6 +7,7 @@ names, fields, versions or array types are refused.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any, TypeVar
 
@@ -49,7 +50,9 @@ for _cls in (
 
 def pack(message: Any) -> bytes:
     """One registered value as bytes."""
-    return msgpack.packb([WIRE_VERSION, _lower(message)], use_bin_type=True)
+    packed = msgpack.packb([WIRE_VERSION, _lower(message)], use_bin_type=True)
+    assert packed is not None, "packb always answers"
+    return packed
 
 
 def unpack(raw: bytes) -> Any:
@@ -84,7 +87,7 @@ def _lower(value: Any) -> Any:
         return {"!": name, "f": {f.name: _lower(getattr(value, f.name)) for f in dataclasses.fields(value)}}
     if isinstance(value, tuple | list):
         return [_lower(v) for v in value]
-    if hasattr(value, "items"):
+    if isinstance(value, Mapping):
         return {"!map": [[_lower(k), _lower(v)] for k, v in value.items()]}
     raise WireError(f"a {type(value).__name__} does not travel")
 

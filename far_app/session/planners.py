@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Generator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class LockstepPlanner:
 
     def plan(
         self, history: History, tick: int, noise_key: NoiseKey
-    ) -> Generator[PlanRequest, ActionChunk, Sequence[ActionChunk]]:
+    ) -> Generator[PlanRequest, Any, Sequence[ActionChunk]]:
         assert self._policy is not None, "begin comes first"
         chunk = yield PlanRequest(history=history, tick=tick, noise_key=noise_key, policy=self._policy)
         self._pending.append(chunk)
@@ -95,7 +96,7 @@ class ThreadedPlanner:
 
     def plan(
         self, history: History, tick: int, noise_key: NoiseKey
-    ) -> Generator[PlanRequest, ActionChunk, Sequence[ActionChunk]]:
+    ) -> Generator[PlanRequest, Any, Sequence[ActionChunk]]:
         yield from ()
         with self._changed:
             assert self._policy is not None, "begin comes first"

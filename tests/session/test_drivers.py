@@ -177,3 +177,9 @@ def test_a_cancelled_adaptation_ends_between_two_batches():
     adaptation.cancel(wait=True)
     assert not adaptation.running
     assert adaptation.result().status == "cancelled" and method.policy.version == "forward-0"
+
+
+def test_a_value_that_came_with_a_later_tick_still_reaches_its_step():
+    result, _ = lockstep_trial(delay_ticks=2)
+    values = [s.value for s in result.attempts[0].steps]
+    assert np.isfinite(values[:-2]).all() and np.isnan(values[-2:]).all()
