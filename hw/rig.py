@@ -90,8 +90,9 @@ def _build(cls: type, table: dict[str, Any], where: str) -> Any:
     values = {}
     for key, value in table.items():
         if isinstance(value, dict):
-            value = _build(parts[key], value, f"{where}.{key}")
-        values[key] = tuple(value) if isinstance(value, list) else value
+            values[key] = _build(parts[key], value, f"{where}.{key}")
+        else:
+            values[key] = tuple(value) if isinstance(value, list) else value
     try:
         return cls(**values)
     except TypeError as error:

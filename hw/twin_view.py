@@ -70,11 +70,12 @@ def thin_meshes(spec: mujoco.MjSpec, budget: int = FACE_BUDGET) -> None:
     for mesh in spec.meshes:
         if not mesh.file:
             continue
-        shape = trimesh.load(mesh.file, force="mesh", process=True)
+        shape: Any = trimesh.load(mesh.file, force="mesh", process=True)
         shape.merge_vertices(merge_tex=True, merge_norm=True)
-        vertices, faces = np.asarray(shape.vertices, np.float32), np.asarray(shape.faces, np.int32)
+        vertices: Any = np.asarray(shape.vertices, np.float32)
+        faces: Any = np.asarray(shape.faces, np.int32)
         if len(faces) > budget:
-            vertices, faces = fast_simplification.simplify(vertices, faces, target_count=budget)
+            vertices, faces, *_ = fast_simplification.simplify(vertices, faces, target_count=budget)
         mesh.file = ""
         mesh.uservert = np.asarray(vertices, float).ravel()
         mesh.userface = np.asarray(faces, np.int32).ravel()

@@ -134,7 +134,7 @@ class Console:
             self._images[camera] = self._gui.add_image(_BLANK, format="jpeg")
 
     def _add_plots(self) -> None:
-        axes = (_axis(size=24), _axis(size=42))
+        axes = (_axis(size=24), _axis(size=46))
         dots: Any = {"show": False}
         still: Any = {"show": False}
         clear: Any = {"stroke": _CLEAR, "points": dots, "scale": "flag"}

@@ -111,10 +111,10 @@ def _padded(values: Float[np.ndarray, "T"], length: int) -> Float[np.ndarray, "N
 
 
 def _frame(values: Float[np.ndarray, "M"], length: int) -> Float[np.ndarray, "N"]:
-    """Two points at limits rounded outwards to a fifth of the span's power of ten."""
+    """Two points at limits rounded outwards to a fifth of the span's power of ten; the span at least a tenth of V."""
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
-    span = max(high - low, 0.05)
+    span = max(high - low, 0.05, 0.1 * abs(high))
     unit = 10 ** math.floor(math.log10(span)) / 5
     frame = np.full(length, np.nan)
     frame[0] = math.floor(low / unit) * unit

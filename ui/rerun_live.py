@@ -38,8 +38,8 @@ from ui.rerun_views import (
     TIMELINE,
     Curves,
     blueprint,
-    log_attempt,
     log_attribution,
+    log_cameras,
     log_event,
     log_styles,
     log_values,
@@ -75,6 +75,7 @@ class LiveLog:
         if (t.trial, t.attempt) != self._attempt:
             self._attempt, self._attributed = (t.trial, t.attempt), False
             self._began, self._known = now - t.tick / t.rate, np.zeros(0, dtype=bool)
+            self._break_lines(self._began - 1e-3)
         times = self._began + np.arange(len(t.values)) / t.rate
         self._values(t, times)
         if len(t.value_changes) and not self._attributed:
@@ -89,6 +90,12 @@ class LiveLog:
             if line.stamp > self._event:
                 log_event(self._recording, line.stamp - self.origin, line.text, line.level.upper()[:4])
                 self._event = line.stamp
+
+    def _break_lines(self, time: float) -> None:
+        """No line from one attempt to the next."""
+        self._recording.set_time(TIMELINE, duration=time)
+        for path in ("/value/V", "/change/dV", "/change/threshold", *(f"/action/{name}" for name in ACTIONS)):
+            self._recording.log(path, rr.Scalars(float("nan")))
 
     def _values(self, t: Telemetry, times: np.ndarray) -> None:
         """V of the ticks that were not known before; some come a tick or two late."""
@@ -163,7 +170,7 @@ def serve(options: argparse.Namespace, ended: threading.Event) -> None:
 def add_cameras(recording: rr.RecordingStream, live: LiveLog, closed: Sequence[Path]) -> None:
     for file in closed:
         try:
-            log_attempt(recording, read_attempt(file), live.origin or 0.0, curves=False)
+            log_cameras(recording, read_attempt(file).steps, live.origin or 0.0)
         except (FarError, OSError) as error:
             log.warning("%s is not shown: %s", file, error)
 

@@ -193,14 +193,10 @@ def curves_of(attempt: AttemptRecording, origin: float) -> Curves:
     )  # fmt: skip
 
 
-def log_attempt(
-    recording: rr.RecordingStream, attempt: AttemptRecording, origin: float, *, curves: bool = True
-) -> None:
-    """All that a recording holds; without curves, what a live log does not have yet."""
+def log_attempt(recording: rr.RecordingStream, attempt: AttemptRecording, origin: float) -> None:
+    """All that a recording holds."""
     log_cameras(recording, attempt.steps, origin)
     log_steps(recording, attempt.steps, origin)
-    if not curves:
-        return
     known = curves_of(attempt, origin)
     log_values(recording, known.times, known.values)
     log_attribution(recording, known, attempt.frames)

@@ -15,7 +15,8 @@ from ui.plot_model import flagged_ticks
 
 BRAND = (63, 184, 255)
 FLAGGED = (255, 77, 79)
-TRAIL = (84, 110, 138)
+DEEP_RED, DEEP_BLUE, TRAIL = (200, 0, 8), (0, 90, 220), (40, 58, 80)
+"""For lines in 3D, which the lights wash out."""
 STILL = 1e-5
 """Changes of a body's pose below this (metres, quaternion units) are not sent."""
 TRAIL_LIMIT = 600
@@ -80,14 +81,14 @@ class Scene3D:
             before[moved] = body_poses[moved]
 
     def chunk(self, telemetry: Telemetry) -> None:
-        """The path of the newest chunk, brand-coloured; red when that chunk is flagged."""
+        """The path of the newest chunk while it is followed, blue; red when that chunk is flagged."""
         points = np.asarray(telemetry.chunk_path, dtype=np.float32)
-        if len(points) < 2:
+        if len(points) < 2 or telemetry.state is not State.RUNNING:
             if self._path is not None:
                 self._path.visible = False
             return
         segments = np.stack([points[:-1], points[1:]], axis=1)
-        color = FLAGGED if telemetry.tick in telemetry.flagged else BRAND
+        color = DEEP_RED if telemetry.tick in telemetry.flagged else DEEP_BLUE
         colors = np.broadcast_to(np.array(color, np.uint8), segments.shape).copy()
         if self._path is None or self._path.points.shape != segments.shape:
             self._path = self._scene.add_line_segments("/chunk", segments, colors, thickness=0.01)
@@ -118,9 +119,9 @@ class Scene3D:
         segments = np.stack([points[:-1], points[1:]], axis=1)
         covered = flagged_ticks(telemetry.flagged, telemetry.chunk_horizon, self._trail[-1][0] + 1)
         red = np.array([covered[tick] for tick, _ in self._trail[1:]])
-        colors = np.where(red[:, None, None], np.array(FLAGGED, np.uint8), np.array(TRAIL, np.uint8))
+        colors = np.where(red[:, None, None], np.array(DEEP_RED, np.uint8), np.array(TRAIL, np.uint8))
         colors = np.broadcast_to(colors, segments.shape).astype(np.uint8)
-        self._trail_line = self._scene.add_line_segments("/trail", segments, colors, thickness=0.005)
+        self._trail_line = self._scene.add_line_segments("/trail", segments, colors, thickness=0.008)
 
 
 def _tinted(mesh: BodyMesh) -> tuple[float, float, float]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import gc
 import logging
+import queue
 import signal
 import sys
 import threading
@@ -31,8 +32,9 @@ from ui.view_model import Freshness
 
 log = logging.getLogger(__name__)
 
-TICK = 1 / 15
-"""Seconds between two looks at the sockets; poses are pushed at this rate."""
+TICK = 1 / 10
+"""Seconds between two looks at the sockets; pictures and poses are pushed at this rate, in one window, so that a
+browser without a graphics card draws once for both."""
 
 
 @dataclass
@@ -75,8 +77,7 @@ class Page:
         self._stop_line = StopLine(endpoints.stop)
         self._console = Console(self._server, self._stop_line, self._latest, scene3d=options.scene3d)
         self._viewer = LiveViewer(options.run_folder, options.recordings) if options.rerun else None
-        self._pictures, self._plots, self._texts, self._beats = Every(1 / 12), Every(1 / 5), Every(1 / 5), Every(1 / 2)
-        self._trails = Every(1 / 5)
+        self._plots, self._texts, self._trails, self._beats = Every(1 / 5), Every(1 / 5), Every(1 / 5), Every(1 / 2)
         self._hw_seq = 0
 
     def _latest(self) -> tuple[Telemetry | None, Freshness]:
@@ -88,12 +89,11 @@ class Page:
     def tick(self) -> None:
         """One look at the sockets; whatever is due is sent to the browsers in one window."""
         now = time.monotonic()
-        self._send_intents()
         heard = self._feeds.telemetry.poll()
         telemetry, fresh = self._latest()
         with self._server.atomic():
-            self._show_view(now)
-            if self._beats(now) and not (telemetry is not None and fresh.app is None):
+            self._show_view()
+            if self._beats(now):
                 self._console.beat(fresh)
             if self._texts(now):
                 viewer = self._viewer.url if self._viewer is not None else None
@@ -107,7 +107,7 @@ class Page:
                     if self._trails(now):
                         self._console.scene.trail(telemetry)
 
-    def _show_view(self, now: float) -> None:
+    def _show_view(self) -> None:
         scene = self._console.scene
         if scene is not None:
             geometry = self._feeds.geometry.poll()
@@ -121,12 +121,15 @@ class Page:
         self._hw_seq = view.seq
         if scene is not None:
             scene.pose(view.body_poses)
-        if self._pictures(now):
-            self._console.pictures(view)
+        self._console.pictures(view)
 
-    def _send_intents(self) -> None:
-        while not self._console.pressed.empty():
-            intent = self._console.pressed.get()
+    def rest(self, until: float) -> None:
+        """Wait for the next tick (monotonic seconds); what is pressed meanwhile goes to the app at once."""
+        while True:
+            try:
+                intent = self._console.pressed.get(timeout=max(0.0, until - time.monotonic()))
+            except queue.Empty:
+                return
             if not self._feeds.send(intent, self._options.operator) and intent is not Intent.STOP:
                 log.warning("nobody takes the intent %s: is the app running?", intent.value)
 
@@ -149,7 +152,7 @@ def serve(options: PageOptions, ended: threading.Event) -> None:
         while not ended.is_set() and not orphaned():
             page.tick()
             due = max(due + TICK, time.monotonic())
-            ended.wait(due - time.monotonic())
+            page.rest(due)
     finally:
         page.close()
 

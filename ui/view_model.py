@@ -242,7 +242,7 @@ def loop_gauges(telemetry: Telemetry | None) -> tuple[Gauge, ...]:
     moving = telemetry.state is State.RUNNING
     slow = moving and loop.ticks > 0 and abs(loop.hz - telemetry.rate) > 0.05 * telemetry.rate
     gauges = [
-        Gauge(label="loop", value=f"{loop.hz:.1f} Hz", tone=Tone.WARN if slow else Tone.IDLE),
+        Gauge(label="loop", value=f"{loop.hz:.1f} Hz" if loop.hz else "– Hz", tone=Tone.WARN if slow else Tone.IDLE),
         Gauge(label="late p50", value=f"{loop.late_p50_ms:.1f} ms"),
         Gauge(label="p99", value=f"{loop.late_p99_ms:.1f} ms", tone=Tone.WARN if loop.late_p99_ms > 5 else Tone.IDLE),
         Gauge(label="max", value=f"{loop.late_max_ms:.1f} ms"),

@@ -65,7 +65,11 @@ def main(arguments: Sequence[str]) -> int:
 def run_plan(folder: Path, plan: EvaluationPlan, workers: int) -> None:
     total = plan.scenes * len(plan.arms)
     with tqdm(total=total, unit="episode") as bar:
-        evaluate(folder, plan, workers, lambda record: bar.update(), begin, work)
+
+        def count(record: dict[str, Any]) -> None:
+            bar.update()
+
+        evaluate(folder, plan, workers, count, begin, work)
 
 
 def summary(folder: Path, plan: EvaluationPlan) -> str:

@@ -7,6 +7,8 @@ and the previous frame's features can be kept.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
@@ -14,6 +16,8 @@ from torch import Tensor, nn
 
 class SpatialSoftmax(nn.Module):
     """Where each feature map fires: the mean image coordinate under its softmax, in [−1, 1] (Levine et al. 2016)."""
+
+    grid: Tensor
 
     def __init__(self, height: int, width: int) -> None:
         super().__init__()
@@ -72,16 +76,20 @@ class GroupNorm16(nn.GroupNorm):
 
 
 class ResNet18Camera(nn.Module):
-    """ResNet-18 without its classifier; input scaled to 224, spatial softmax over 64 maps, linear to 64.
+    """ResNet-18 without its classifier; pictures at their own size, spatial softmax over 64 maps, linear to 64.
 
     State-dict names of the trunk are torchvision's.
     """
 
-    INPUT = 224
+    mean: Tensor
+    std: Tensor
+    layer1: nn.Sequential
+    layer2: nn.Sequential
+    layer3: nn.Sequential
+    layer4: nn.Sequential
 
     def __init__(self, image_size: int, maps: int = 64, out: int = 64, norm: str = "group") -> None:
         super().__init__()
-        self.input_size = min(self.INPUT, image_size)
         layer: type[nn.Module] = GroupNorm16 if norm == "group" else nn.BatchNorm2d
         self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
         self.bn1 = layer(64)
@@ -90,7 +98,7 @@ class ResNet18Camera(nn.Module):
             blocks = nn.Sequential(BasicBlock(inner, outer, stride, layer), BasicBlock(outer, outer, 1, layer))
             setattr(self, f"layer{i}", blocks)
         self.keypoints = nn.Conv2d(512, maps, 1)
-        side = -(-self.input_size // 32)
+        side = -(-image_size // 32)
         self.softmax = SpatialSoftmax(side, side)
         self.head = nn.Linear(2 * maps, out)
         self.register_buffer("mean", torch.tensor([0.485, 0.456, 0.406]).view(1, 3, 1, 1), persistent=False)
@@ -114,12 +122,16 @@ class ObservationEncoder(nn.Module):
         count = n_obs if self.per_frame else 1
         make = ResNet18Camera if self.per_frame else LightCamera
         self.nets = nn.ModuleDict({c: nn.ModuleList(make(image_size) for _ in range(count)) for c in cameras})
-        self.frame_dim = next(iter(self.nets.values()))[0].dim if cameras else 0
+        self.frame_dim: int = self._net(cameras[0], 0).dim if cameras else 0
         self.dim = n_obs * (len(cameras) * self.frame_dim + state_dim)
+
+    def _net(self, camera: str, index: int) -> Any:
+        nets: Any = self.nets[camera]
+        return nets[index]
 
     def camera_features(self, camera: str, frame: int, images: UInt8[Tensor, "B S S 3"]) -> Float[Tensor, "B D"]:
         """Features of one camera's pictures at one place in the history (0 oldest)."""
-        net = self.nets[camera][frame if self.per_frame else 0]
+        net = self._net(camera, frame if self.per_frame else 0)
         return net(images.permute(0, 3, 1, 2).float().mul_(1 / 127.5).sub_(1.0))
 
     def forward(

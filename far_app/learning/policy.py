@@ -11,6 +11,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -168,6 +169,11 @@ def save_policy(policy: DiffusionPolicy, path: Path, card: dict[str, object] | N
     partial.replace(path)
 
 
+def _tupled(value: Any) -> Any:
+    """JSON's lists are the configuration's tuples."""
+    return tuple(value) if isinstance(value, list) else value
+
+
 def load_policy(path: Path, task: str | None = None, device: str = "cpu") -> DiffusionPolicy:
     """Read a checkpoint; CheckpointError when it is missing, truncated, of another kind or for another task."""
     if not path.exists():
@@ -182,8 +188,8 @@ def load_policy(path: Path, task: str | None = None, device: str = "cpu") -> Dif
         ) from error
     if metadata.get("format") != FORMAT:
         raise CheckpointError(f"{path} holds format {metadata.get('format')!r}, a policy has {FORMAT!r}")
-    raw = json.loads(metadata["config"])
-    config = PolicyConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in raw.items()})
+    raw: dict[str, Any] = json.loads(metadata["config"])
+    config = PolicyConfig(**{k: _tupled(v) for k, v in raw.items()})
     if task is not None and config.task != task:
         raise CheckpointError(f"{path} was trained for task '{config.task}', this run is '{task}'; give its checkpoint")
     policy = DiffusionPolicy(config)

@@ -135,7 +135,7 @@ def train_policy(
             locator.load_state_dict({k[8:]: v for k, v in tensors.items() if k.startswith("locator.")})
         ema.load_state_dict({k[4:]: v for k, v in tensors.items() if k.startswith("ema.")})
         restore_optimizer(optimizer, tensors)
-        rng.bit_generator.state = notes["rng"]
+        rng.bit_generator.state = notes["rng"]  # type: ignore[assignment]
         generator.set_state(tensors["generator"])
         done = int(notes["iteration"])  # type: ignore[call-overload]
         log.info("going on from iteration %d of %s", done, folder)
@@ -175,7 +175,8 @@ def train_policy(
         optimizer.step()
         decay = 1.0 - (1 + iteration) ** -training.ema_power
         with torch.no_grad():
-            torch._foreach_lerp_(list(ema.parameters()), list(policy.parameters()), 1.0 - decay)
+            for slow, fast in zip(ema.parameters(), policy.parameters(), strict=True):
+                slow.lerp_(fast, 1.0 - decay)
         losses.append(loss.item())
         if (iteration + 1) % training.log_every == 0 or iteration + 1 == training.iterations:
             mean = float(np.mean(losses))

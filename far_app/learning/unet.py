@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float
@@ -16,6 +17,8 @@ from torch import Tensor, nn
 
 class StepEmbedding(nn.Module):
     """Sinusoidal embedding of the diffusion step, then two linear layers."""
+
+    frequencies: Tensor
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -87,13 +90,13 @@ class ConditionalUnet1d(nn.Module):
         condition = torch.cat([self.step_embedding(k), features], dim=-1)
         x = noisy.transpose(1, 2)
         skips: list[Tensor] = []
-        for first, second, shrink in self.downs:
+        for first, second, shrink in cast("list[Any]", self.downs):
             x = second(first(x, condition), condition)
             skips.append(x)
             x = shrink(x)
         for block in self.middle:
             x = block(x, condition)
-        for first, second, grow in self.ups:
+        for first, second, grow in cast("list[Any]", self.ups):
             x = second(first(torch.cat([x, skips.pop()], dim=1), condition), condition)
             x = grow(x)
         return self.out(x).transpose(1, 2)
