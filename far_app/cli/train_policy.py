@@ -7,6 +7,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -34,8 +35,10 @@ class TrainPolicyOptions:
     device: str = "cpu"
     threads: int = 2
     """torch threads."""
+    norm: Literal["group", "batch"] = "group"
+    """Normalisation in the paper preset's ResNets."""
     imagenet: Path | None = None
-    """torchvision's resnet18 weights as safetensors (paper preset)."""
+    """torchvision's resnet18 file (paper preset); found in its cache or downloaded by default."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -52,7 +55,7 @@ def main(arguments: Sequence[str]) -> int:
     check_device(options.device)
     torch.set_num_threads(options.threads)
     task = find_task(options.task)
-    config = preset(options.preset, task.name)
+    config = dataclasses.replace(preset(options.preset, task.name), norm=options.norm)
     training = dataclasses.replace(TRAININGS[options.preset], seed=options.seed)
     if options.iterations is not None:
         training = dataclasses.replace(training, iterations=options.iterations)

@@ -115,13 +115,18 @@ class ResNet18Camera(nn.Module):
 class ObservationEncoder(nn.Module):
     """Images (uint8) of every camera and frame, and the normalised state, to features (B, F)."""
 
-    def __init__(self, kind: str, cameras: tuple[str, ...], image_size: int, n_obs: int, state_dim: int) -> None:
+    def __init__(
+        self, kind: str, cameras: tuple[str, ...], image_size: int, n_obs: int, state_dim: int, norm: str
+    ) -> None:
         super().__init__()
         self.kind, self.camera_names, self.n_obs = kind, cameras, n_obs
         self.per_frame = kind == "resnet18"
         count = n_obs if self.per_frame else 1
-        make = ResNet18Camera if self.per_frame else LightCamera
-        self.nets = nn.ModuleDict({c: nn.ModuleList(make(image_size) for _ in range(count)) for c in cameras})
+
+        def make() -> nn.Module:
+            return ResNet18Camera(image_size, norm=norm) if self.per_frame else LightCamera(image_size)
+
+        self.nets = nn.ModuleDict({c: nn.ModuleList(make() for _ in range(count)) for c in cameras})
         self.frame_dim: int = self._net(cameras[0], 0).dim if cameras else 0
         self.dim = n_obs * (len(cameras) * self.frame_dim + state_dim)
 

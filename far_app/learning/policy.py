@@ -40,6 +40,8 @@ class PolicyConfig:
     task: str
     encoder: str
     """"light" or "resnet18"."""
+    norm: str = "group"
+    """Normalisation in a ResNet: "group" (16 channels a group) or "batch"."""
     cameras: tuple[str, ...] = ("front", "wrist")
     image_size: int = 84
     n_obs: int = 2
@@ -108,7 +110,9 @@ class DiffusionPolicy(nn.Module):
         super().__init__()
         self.config = config
         self.normalizer = Normalizer()
-        self.encoder = ObservationEncoder(config.encoder, config.cameras, config.image_size, config.n_obs, STATE_DIM)
+        self.encoder = ObservationEncoder(
+            config.encoder, config.cameras, config.image_size, config.n_obs, STATE_DIM, config.norm
+        )
         self.denoiser = ConditionalUnet1d(
             ACTION_DIM, self.encoder.dim, widths=config.widths, kernel=config.kernel, step_dim=config.step_dim
         )

@@ -177,6 +177,8 @@ def train_policy(
         with torch.no_grad():
             for slow, fast in zip(ema.parameters(), policy.parameters(), strict=True):
                 slow.lerp_(fast, 1.0 - decay)
+            for slow, fast in zip(ema.buffers(), policy.buffers(), strict=True):
+                slow.copy_(fast)
         losses.append(loss.item())
         if (iteration + 1) % training.log_every == 0 or iteration + 1 == training.iterations:
             mean = float(np.mean(losses))
