@@ -14,24 +14,22 @@ from typing import Any
 
 import numpy as np
 import viser
-from viser import uplot
 
 from far_app.session_states import Intent, State
 from far_app.telemetry import Telemetry, View
 from far_app.types import RobotMode
 from ui import html
 from ui.page_server import Presses
-from ui.plot_model import change_plot, value_plot
+from ui.plots import Plots
 from ui.scene3d import BRAND, FLAGGED, Scene3D
 from ui.stop import StopLine
 from ui.view_model import Freshness, adaptation, arm_word, banner, control, loop_gauges, summary
 
 CAMERAS = ("front", "wrist")
+CONFIRM = 4.0
+"""Seconds within which a second click ends the session."""
 _STYLE = (Path(__file__).parent / "style.css").read_text(encoding="utf-8")
 _BLANK = np.full((8, 8, 3), 8, np.uint8)
-_RED = "rgb(255, 77, 79)"
-_BLUE = "rgb(63, 184, 255)"
-_CLEAR = "rgba(0, 0, 0, 0)"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,14 +80,11 @@ class Console:
         """Why the page itself refused the last press."""
         self._gui, self._stop, self._latest = server.gui, stop_line, latest
         self._presses = Presses(server)
-        self._refused_at = 0.0
+        self._refused_at = self._ending_until = 0.0
         self._beats = 0
         self._images: dict[str, viser.GuiImageHandle] = {}
         self._pictures: dict[str, bytes] = {}
         self._controls: dict[Intent, tuple[_Button, viser.GuiButtonHandle, Any]] = {}
-        self._plotted: tuple[object, ...] = ()
-        self._length = 151
-        self._nudge = 1.0
         server.gui.configure_theme(dark_mode=True, brand_color=BRAND, show_logo=False, show_share_button=False)
         server.gui.set_panel_label("FAR")
         self.scene = Scene3D(server) if scene3d else None
@@ -113,7 +108,7 @@ class Console:
         self._history = gui.add_html(html.history((), summary(())))
         self._events = gui.add_html(html.events((), 0.0))
         self._add_cameras()
-        self._add_plots()
+        self.plots = Plots(gui)
         self._foot = gui.add_html(html.foot((), "", None, ""))
         gui.add_html(f"<style>{_STYLE}\n@media (min-width: 768px) {{ {' '.join(places)} }}</style>")
 
@@ -133,48 +128,6 @@ class Console:
             self._gui.add_html(html.caption(camera, "", f"mark-{camera}"))
             self._images[camera] = self._gui.add_image(_BLANK, format="jpeg")
 
-    def _add_plots(self) -> None:
-        axes = (_axis(size=24), _axis(size=46))
-        dots: Any = {"show": False}
-        still: Any = {"show": False}
-        clear: Any = {"stroke": _CLEAR, "points": dots, "scale": "flag"}
-        frame: Any = {"stroke": _CLEAR, "points": dots}
-        nudge: Any = {"stroke": _CLEAR, "points": dots, "scale": "nudge"}
-        # Only `frame` sets the y axis: a series that begins with NaN would make uPlot's range NaN.
-        v = value_plot(None)
-        self._value_caption = self._gui.add_html(html.value_caption(None))
-        self._value = self._gui.add_uplot(
-            (v.tick, v.shade, v.floor, v.value, v.frame, v.floor),
-            (
-                {"label": "tick"},
-                clear,
-                clear,
-                {"stroke": _BLUE, "width": 2.5, "points": dots, "auto": False},
-                frame,
-                nudge,
-            ),
-            bands=(uplot.Band(series=(1, 2), fill="rgba(255, 77, 79, 0.38)"),),
-            scales=_scales(150) | {"flag": uplot.Scale(range=(0.0, 1.0))},
-            axes=axes, legend={"show": False}, cursor=still, aspect=2.6, padding=(8, 20, 0, 0),
-        )  # fmt: skip
-        c = change_plot(None)
-        self._change_caption = self._gui.add_html(html.change_caption(None))
-        flagged: Any = {"show": True, "size": 8, "fill": _RED, "stroke": _RED}
-        self._change = self._gui.add_uplot(
-            (c.tick, c.zero, c.change, c.threshold, c.flagged, c.frame, c.zero),
-            (
-                {"label": "tick"},
-                {"stroke": "rgb(59, 76, 94)", "width": 1, "points": dots, "auto": False},
-                {"stroke": "rgb(170, 190, 208)", "width": 2, "points": dots, "auto": False},
-                {"stroke": _RED, "width": 1.5, "dash": (6, 5), "points": dots, "auto": False},
-                {"stroke": _CLEAR, "points": flagged, "auto": False},
-                frame,
-                nudge,
-            ),
-            scales=_scales(150),
-            axes=axes, legend={"show": False}, cursor=still, aspect=2.85, padding=(8, 20, 0, 0),
-        )  # fmt: skip
-
     def _press_stop(self, source: str) -> None:
         self._stop.press(source)
         self.pressed.put(Intent.STOP)
@@ -185,15 +138,18 @@ class Console:
         asked = control(intent, telemetry, fresh)
         if by_key and intent is Intent.RESUME and asked.enabled and telemetry and telemetry.state is not State.PAUSED:
             self._refuse(intent, "after a stop or a fault, click it")
+        elif asked.enabled and intent is Intent.QUIT and time.monotonic() > self._ending_until:
+            self._ending_until = time.monotonic() + CONFIRM
         elif asked.enabled:
             self.pressed.put(intent)
         else:
             self._refuse(intent, asked.reason)
 
-    @staticmethod
-    def _hint(button: _Button, telemetry: Telemetry | None) -> str:
+    def _hint(self, button: _Button, telemetry: Telemetry | None) -> str:
         if button.intent is Intent.RESUME and telemetry is not None and telemetry.state is not State.PAUSED:
             return "the arm may move"
+        if button.intent is Intent.QUIT and time.monotonic() < self._ending_until:
+            return "click again to end it"
         return f"key {button.key}" if button.key else ""
 
     def _refuse(self, intent: Intent, reason: str) -> None:
@@ -234,29 +190,6 @@ class Console:
                 image._data = jpeg
                 self._pictures[camera] = jpeg
 
-    def plots(self, telemetry: Telemetry) -> None:
-        """Sent when something changed, and every two seconds.
-
-        uplot-react forgets to lay out the axes when new data comes in the very render in which a chart learns its
-        width, and stays so until some scale changes: an invisible series on a scale of its own makes one change."""
-        t = telemetry
-        last = float(t.values[-1]) if len(t.values) else 0.0
-        beat = int(time.monotonic() / 2)
-        key = (t.trial, t.attempt, len(t.values), last, len(t.value_changes), t.flagged, t.horizon, beat)
-        if key == self._plotted:
-            return
-        self._plotted = key
-        v, c = value_plot(t), change_plot(t)
-        self._nudge = 3.0 - self._nudge
-        if len(v.tick) != self._length:
-            self._length = len(v.tick)
-            self._value.scales = _scales(self._length - 1) | {"flag": uplot.Scale(range=(0.0, 1.0))}
-            self._change.scales = _scales(self._length - 1)
-        self._value_caption.content, self._change_caption.content = html.value_caption(t), html.change_caption(t)
-        nudge = np.linspace(0, self._nudge, len(v.tick))
-        self._value.data = (v.tick, v.shade, v.floor, v.value, v.frame, nudge)
-        self._change.data = (c.tick, c.zero, c.change, c.threshold, c.flagged, c.frame, nudge)
-
 
 def _place(handle: viser.GuiButtonHandle, box: tuple[float, float, float, float]) -> str:
     left, top, width, height = box
@@ -276,15 +209,3 @@ def _big(handle: viser.GuiButtonHandle) -> str:
         f"letter-spacing: .04em; }} div:has(> {button}) {{ z-index: 70 !important; }} "
         f"{lost} > div:has(> {button}) {{ z-index: 20 !important; }}"
     )
-
-
-def _scales(last_tick: int) -> dict[str, Any]:
-    """A fixed x range: with an automatic one viser keeps 0 … 1 of a plot that began without data."""
-    return {"x": uplot.Scale(time=False, range=(0.0, float(last_tick)))}
-
-
-def _axis(size: int) -> Any:
-    return {
-        "stroke": "rgb(143, 161, 179)", "size": size, "font": "14px sans-serif", "gap": 4,
-        "grid": {"stroke": "rgba(255, 255, 255, 0.05)", "width": 1}, "ticks": {"show": False},
-    }  # fmt: skip

@@ -63,7 +63,7 @@ def stop_note(result: StopResult | None, latched: bool, reason: str) -> str:
         text, tone = "NOT CONFIRMED: the hw server does not answer. Use the stop at the arm!", Tone.BAD
     elif latched:
         took = f" in {result.latency_ms:.0f} ms" if result is not None and math.isfinite(result.latency_ms) else ""
-        text, tone = f"latched{took}" + (f" · {reason}" if reason else ""), Tone.BAD
+        text, tone = f"latched{took}" if took else f"latched: {reason}" if reason else "latched", Tone.BAD
     return f'<div class="far-stopnote tone-{tone}" id="op-stop">{escape(text)}</div>'
 
 

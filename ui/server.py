@@ -27,7 +27,7 @@ from ui.feeds import Feeds
 from ui.live_viewer import LiveViewer
 from ui.page_server import open_page, page_url
 from ui.parent import die_with_parent
-from ui.stop import StopLine
+from ui.stop import StopLine, hasten
 from ui.view_model import Freshness
 
 log = logging.getLogger(__name__)
@@ -73,6 +73,9 @@ class Page:
         endpoints = Endpoints.in_folder(options.run_folder)
         self._server = open_page(options.host, options.port)
         self.port = self._server.get_port()
+        listener = self._server._websock_server._server_thread
+        if listener is not None and listener.native_id is not None:
+            hasten(listener.native_id)  # the thread that hears STOP
         self._feeds = Feeds(endpoints)
         self._stop_line = StopLine(endpoints.stop)
         self._console = Console(self._server, self._stop_line, self._latest, scene3d=options.scene3d)
@@ -100,7 +103,7 @@ class Page:
                 self._console.text(telemetry, self._feeds.view.message, fresh, viewer)
             if telemetry is not None and heard:
                 if self._plots(now):
-                    self._console.plots(telemetry)
+                    self._console.plots.show(telemetry)
                 if self._console.scene is not None:
                     self._console.scene.chunk(telemetry)
                     self._console.scene.follow(telemetry)

@@ -112,8 +112,11 @@ def _detail(telemetry: Telemetry) -> str:
         return f"Next attempt in {t.countdown:.0f} s. Pause to cancel."
     home = f"going home {100 * t.homing_progress:.0f} %"
     if t.state is State.ADAPTING:
-        flagged = _count(len(t.flagged), "chunk") + " flagged"
-        return " · ".join([f"Attempt {t.attempt} failed", flagged, home if t.homing_progress < 1 else "at home"])
+        flagged = (
+            _count(len(t.flagged), "chunk") + " flagged" if t.flagged else _STATUS.get(t.adaptation_status, ("",))[0]
+        )
+        parts = [f"Attempt {t.attempt} failed", flagged, home if t.homing_progress < 1 else "at home"]
+        return " · ".join(part for part in parts if part)
     if t.reason:
         return t.reason
     return {
@@ -240,7 +243,7 @@ def loop_gauges(telemetry: Telemetry | None) -> tuple[Gauge, ...]:
         return ()
     loop, robot = telemetry.loop, telemetry.robot
     moving = telemetry.state is State.RUNNING
-    slow = moving and loop.ticks > 0 and abs(loop.hz - telemetry.rate) > 0.05 * telemetry.rate
+    slow = moving and loop.hz > 0 and abs(loop.hz - telemetry.rate) > 0.05 * telemetry.rate
     gauges = [
         Gauge(label="loop", value=f"{loop.hz:.1f} Hz" if loop.hz else "– Hz", tone=Tone.WARN if slow else Tone.IDLE),
         Gauge(label="late p50", value=f"{loop.late_p50_ms:.1f} ms"),

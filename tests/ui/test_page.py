@@ -121,17 +121,21 @@ def test_space_stops_and_does_not_press_the_focused_button(tab: Any, source: Sta
         ("Mark success", "s", Intent.MARK_SUCCESS),
         ("Mark failure", "f", Intent.MARK_FAILURE),
         ("Skip trial", "k", Intent.SKIP_TRIAL),
-        ("End session", None, Intent.QUIT),
     ],
 )
-def test_every_live_control_sends_its_intent(
-    tab: Any, source: Stage, label: str, key: str | None, intent: Intent
-) -> None:
+def test_every_live_control_sends_its_intent(tab: Any, source: Stage, label: str, key: str, intent: Intent) -> None:
     button(tab, label).click()
     assert wait_until(lambda: heard(source) == [intent])
-    if key is not None:
-        tab.keyboard.press(key)
-        assert wait_until(lambda: heard(source) == [intent, intent])
+    tab.keyboard.press(key)
+    assert wait_until(lambda: heard(source) == [intent, intent])
+
+
+def test_ending_the_session_takes_a_second_click(tab: Any, source: Stage) -> None:
+    button(tab, "End session").click()
+    tab.wait_for_selector("button:has-text('click again')")
+    assert heard(source) == []
+    button(tab, "End session").click()
+    assert wait_until(lambda: heard(source) == [Intent.QUIT])
 
 
 def test_dead_controls_are_disabled_and_say_why(tab: Any, source: Stage) -> None:
