@@ -62,7 +62,7 @@ def assemble(
     else:
         path = Path(policy) if policy is not None else shipped(task.name, "policy")
         beside = shipped(task.name, "critic") if policy is None else path.with_name("critic.safetensors")
-        name = str(path)
+        name = f"shipped: {path.name}" if policy is None else str(path)
         network, critic_network = trained(path, critic or beside, task.name, device, entry.needs_critic)
         if retry.fcpa.guard == "bc" and critic_network is not None:
             demonstrations = load_demonstrations(critic or beside, network)
