@@ -69,23 +69,29 @@ def measure(options: AdaptOptions) -> dict[str, Any]:
             inbox, statistics = IntentInbox(), LoopStatistics()
             adaptations: list[Adaptation] = []
             seconds: list[float] = []
+            ended = threading.Event()
 
             def learn() -> None:
-                for _ in range(options.rounds):
+                while len(seconds) < options.rounds and not ended.is_set():
                     method.begin(failure.scene_seed)
                     began = time.monotonic()
                     adaptation = BackgroundAdaptation(method, failure, limit=600.0)
-                    while not adaptation.done():
+                    while not adaptation.done() and not ended.is_set():
                         time.sleep(0.01)
+                    if ended.is_set():
+                        return adaptation.cancel(wait=True)
                     seconds.append(time.monotonic() - began)
                     adaptations.append(adaptation.result())
-                inbox.put(Intent.QUIT)
+                return inbox.put(Intent.QUIT)
 
             learning = threading.Thread(target=learn, name="bench-learning", daemon=True)
             with stage_.session(stage_.writer(), inbox, statistics, method=Unlearning(method)) as session:
                 learning.start()
-                session.run()
-            learning.join()
+                try:
+                    session.run()
+                finally:
+                    ended.set()
+                    learning.join()
     return {
         "rounds": options.rounds,
         "ticks": len(failure.steps),

@@ -123,7 +123,7 @@ class ThreadedPlanner:
         with self._changed:
             self._closing = True
             self._changed.notify_all()
-        self._thread.join(timeout=5.0)
+        self._thread.join(timeout=30.0)  # a thread inside torch at the interpreter's end would abort it
 
     def _forget(self, policy: Policy) -> None:
         self._policy, self._ready, self.failure = policy, [], None
