@@ -68,6 +68,9 @@ class FCPAConfig:
     """(k, ε) draws a step, shared by a state's negative and its positives; k stratified."""
     reduction: Literal["sum", "mean"] = "sum"
     """Squared error summed over the chunk's entries, as Eq. l_diff reads, or averaged."""
+    arm_only: bool = False
+    """Leave the gripper out of l_diff. With it (the paper), a failure in which the hand closed beside the object
+    teaches the policy not to close at all."""
     guard: Literal["none", "stop", "scale", "bc"] = "none"
     """none is the paper; stop ends the update when l⁺ on fixed draws has risen by guard_rise; scale shrinks the
     loser's gradient so that l⁺ cannot rise to first order; bc adds a behaviour-cloning term on demonstrations."""

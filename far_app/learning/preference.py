@@ -23,6 +23,7 @@ from far_app.config import FCPAConfig
 from far_app.learning.cancellation import Cancelled, check
 from far_app.learning.pairs import BATCH, Pairs
 from far_app.learning.trainable import Trainable
+from far_app.types import ARM_DIMS
 
 AddNoise = Callable[[Float[Tensor, "B H A"], Float[Tensor, "B H A"], Int[Tensor, "B"]], Float[Tensor, "B H A"]]
 """a_k from (a, ε, k)."""
@@ -76,22 +77,24 @@ def denoising_errors(
     features: Float[Tensor, "S F"],
     draws: Draws,
     owner: Int[Tensor, "N"],
-    reduction: str,
+    config: FCPAConfig,
     cancelled: Cancelled,
 ) -> list[Float[Tensor, "B"]]:
-    """Squared error, summed (or averaged) over entries, of every draw of every chunk in its owner's state: N · D rows,
-    a chunk's draws side by side, in batches. `per_chunk` makes l_diff of them."""
+    """Squared error, summed (or averaged) over entries (the arm's alone with `arm_only`), of every draw of every
+    chunk in its owner's state: N · D rows, a chunk's draws side by side, in batches. `per_chunk` makes l_diff of
+    them."""
     per_state = draws.k.shape[1]
     state = owner.repeat_interleave(per_state)
     k, noise = draws.k[owner].flatten(), draws.noise[owner].flatten(0, 1)
     noisy = noising.add_noise(chunks.repeat_interleave(per_state, dim=0), noise, k)
     errors = []
+    dims = ARM_DIMS if config.arm_only else chunks.shape[2]
     for rows in torch.arange(len(noisy)).split(BATCH):
         check(cancelled)
         here, row = state[rows].unique(return_inverse=True)
         predicted = denoiser.run(noisy[rows], k[rows], denoiser.condition(features[here])[row])
-        squared = (noise[rows] - predicted).square().flatten(1)
-        errors.append(squared.sum(1) if reduction == "sum" else squared.mean(1))
+        squared = (noise[rows] - predicted)[..., :dims].square().flatten(1)
+        errors.append(squared.sum(1) if config.reduction == "sum" else squared.mean(1))
     return errors
 
 
@@ -132,7 +135,7 @@ class Objective:
     def errors(self, chunks: Tensor, owner: Tensor, states: slice, draws: Draws) -> list[Tensor]:
         here = Draws(k=draws.k[states], noise=draws.noise[states])
         return denoising_errors(
-            self.denoiser, self.noising, chunks, self.pairs.features[states], here, owner, self.config.reduction,
+            self.denoiser, self.noising, chunks, self.pairs.features[states], here, owner, self.config,
             self.cancelled,
         )  # fmt: skip
 
@@ -202,7 +205,7 @@ class Objective:
         draws = draw(rng, BC_BATCH, 1, self.noising.steps, chunks)
         errors = denoising_errors(
             self.denoiser, self.noising, chunks, demonstrations.features[rows], draws, torch.arange(BC_BATCH),
-            self.config.reduction, self.cancelled,
+            self.config, self.cancelled,
         )  # fmt: skip
         totals = self.zeros()
         self.accumulate(totals, errors, chunks.new_full((BC_BATCH,), 1 / BC_BATCH), 1)
