@@ -7,8 +7,13 @@ import gc
 import os
 import sys
 import threading
+from collections.abc import Iterator
 
+LOOP_PRIORITY = 10
+"""SCHED_FIFO priority of the loop's thread, below the servo thread's: it runs 1 ms of 33 and must not wait its turn."""
 LOOP_NICENESS = -10
+"""Of every thread of the app that runs Python beside the loop (and of the loop where real time is not permitted): one
+that is not scheduled while it holds the interpreter would keep the loop waiting."""
 INFERENCE_NICENESS = -10
 BACKGROUND_NICENESS = 10
 
@@ -20,6 +25,22 @@ def set_niceness(niceness: int) -> bool:
     except (OSError, AttributeError):
         return False
     return True
+
+
+@contextlib.contextmanager
+def loop_priority() -> Iterator[str]:
+    """The best the calling thread can get while inside: "fifo", "nice" or "normal". Threads and processes started
+    inside begin at the usual priority."""
+    thread = threading.get_native_id()
+    try:
+        os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(LOOP_PRIORITY))
+    except (OSError, AttributeError):
+        yield "nice" if set_niceness(LOOP_NICENESS) else "normal"
+        return
+    try:
+        yield "fifo"
+    finally:
+        os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
 
 
 def prepare_process(torch_threads: int) -> None:

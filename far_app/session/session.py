@@ -24,7 +24,7 @@ from far_app.session.inbox import IntentInbox
 from far_app.session.lockstep import FinishedAdaptation
 from far_app.session.planners import ThreadedPlanner
 from far_app.session.publisher import TelemetryPublisher
-from far_app.session.realtime import LOOP_NICENESS, collect_between, collector_off, set_niceness
+from far_app.session.realtime import collect_between, collector_off, loop_priority
 from far_app.session.recorder import Recorder
 from far_app.session.statistics import LoopStatistics
 from far_app.session.supervision import Freshness, Supervision, TrialAbandoned
@@ -104,10 +104,10 @@ class Session:
 
     def run(self) -> list[TrialResult]:
         """All trials, or until the operator quits. Raises SessionFault (headless), RecordingError and RobotError."""
-        set_niceness(LOOP_NICENESS)
         supervision, number = self.supervision, 0
         try:
-            with collector_off():
+            with loop_priority() as scheduling, collector_off():
+                log.info("the loop is scheduled %s", scheduling)
                 self.robot.refresh()
                 while self._between_trials():
                     if self.settings.trials and number == self.settings.trials:
