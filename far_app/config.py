@@ -2,10 +2,36 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal, TypeVar, get_type_hints
 
 from far_app.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
+    """Settings from a TOML table, nested as the dataclasses are; what is not given keeps its default. Raises
+    ConfigError that names the place and what is known there."""
+    fields = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    unknown = sorted(set(table) - set(fields))
+    if unknown:
+        raise ConfigError(f"{where}: unknown setting {', '.join(unknown)}; known: {', '.join(fields)}")
+    kinds, values = get_type_hints(cls), {}
+    for key, value in table.items():
+        if dataclasses.is_dataclass(kinds[key]) != isinstance(value, dict):
+            expected = "a value" if isinstance(value, dict) else "a table"
+            raise ConfigError(f"{where}.{key} is {value!r}, must be {expected}")
+        if isinstance(value, dict):
+            values[key] = from_table(kinds[key], value, f"{where}.{key}")
+        else:
+            values[key] = tuple(value) if isinstance(value, list) else value
+    try:
+        return cls(**values)
+    except TypeError as error:
+        raise ConfigError(f"{where}: {error}") from error
 
 
 def _check(ok: bool, what: str, value: object, limit: str) -> None:
@@ -106,6 +132,8 @@ class PerturbationConfig:
     """h, ticks for which a smoothed target is kept."""
     dims: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
     """Perturbed action dimensions; (0, 1, 2) on hardware (paper, Real-world Experiments)."""
+    first_attempt: int = 2
+    """Attempts from this one on are perturbed (paper: the retries)."""
 
     def __post_init__(self) -> None:
         _check(0 <= self.probability <= 1, "perturbation.probability", self.probability, "in [0, 1]")

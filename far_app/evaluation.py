@@ -10,12 +10,13 @@ import dataclasses
 import json
 import multiprocessing
 import time
+import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from far_app.config import RetryConfig
+from far_app.config import RetryConfig, from_table
 from far_app.errors import ConfigError
 from far_app.protocols import Method
 from far_app.types import Trial
@@ -34,7 +35,7 @@ class Arm:
 
     name: str
     method: str
-    retry: RetryConfig
+    retry: RetryConfig = field(default_factory=RetryConfig)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +56,35 @@ class EvaluationPlan:
         record = json.loads(json.dumps(dataclasses.asdict(self)))
         record.pop("scenes")
         return record
+
+
+def read_arms(path: Path) -> tuple[Arm, ...]:
+    """The columns of a comparison from a TOML file, each with a name, a method and what differs from its defaults:
+
+    [[arm]]
+    name = "far, smaller steps"
+    method = "far"
+    retry.fcpa = { lr = 2e-6, guard = "scale" }
+    """
+    if not path.exists():
+        raise ConfigError(f"no file of arms at {path}; give one, or --methods")
+    try:
+        table = tomllib.loads(path.read_text())
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path} is not valid TOML: {error}") from error
+    entries = table.get("arm")
+    if set(table) != {"arm"} or not isinstance(entries, list) or not entries:
+        raise ConfigError(f"{path} has the tables {', '.join(table) or '(none)'}; it must list [[arm]] tables alone")
+    arms = []
+    for number, entry in enumerate(entries, 1):
+        where = f"{path.name}: arm {number}"
+        missing = {"name", "method"} - set(entry)
+        if missing:
+            raise ConfigError(f"{where} has no {', '.join(sorted(missing))}")
+        arms.append(from_table(Arm, entry, where))
+    if len({a.name for a in arms}) < len(arms):
+        raise ConfigError(f"{path} names an arm twice; every arm needs a name of its own")
+    return tuple(arms)
 
 
 def episode_record(arm: str, scene: int, result: Trial, seconds: float) -> dict[str, Any]:

@@ -4,9 +4,9 @@
     smoothed:   δ*  ~ N(0, σ²) with probability ε, else 0, held for h ticks
                 δ_t = α δ_{t−1} + (1 − α) δ*,   δ_{−1} = 0
 
-Zero on a first attempt; the gripper is never perturbed. Every number is keyed by (scene, attempt, tick), so δ_t does
-not depend on which ticks were asked for. The paper leaves open how long a drawn zero lasts; here it lasts h ticks like
-a drawn target, so that ε is the share of perturbed time for both kinds.
+Zero on a first attempt (unless asked for); the gripper is never perturbed. Every number is keyed by (scene, attempt,
+tick), so δ_t does not depend on which ticks were asked for. The paper leaves open how long a drawn zero lasts; here it
+lasts h ticks like a drawn target, so that ε is the share of perturbed time for both kinds.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def probability(config: PerturbationConfig, attempt_index: int) -> float:
 
 
 def perturbation(config: PerturbationConfig, scene_seed: int, attempt_index: int) -> Perturbation:
-    """δ by tick for one attempt: zeros on the first, or when kind is none."""
-    if config.kind == "none" or attempt_index <= 1 or config.sigma == 0:
+    """δ by tick for one attempt: zeros before config.first_attempt, or when kind is none."""
+    if config.kind == "none" or attempt_index < config.first_attempt or config.sigma == 0:
         return lambda tick: np.zeros(ACTION_DIM)
     epsilon = probability(config, attempt_index)
 

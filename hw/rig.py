@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
+from far_app.config import from_table
 from far_app.errors import ConfigError
 from far_app.motion import ActionScale
 
@@ -81,24 +80,6 @@ class RigConfig:
     """Operator pictures a second."""
 
 
-def _build(cls: type, table: dict[str, Any], where: str) -> Any:
-    fields = {f.name: f for f in dataclasses.fields(cls)}
-    unknown = sorted(set(table) - set(fields))
-    if unknown:
-        raise ConfigError(f"{where}: unknown setting {', '.join(unknown)}; known: {', '.join(fields)}")
-    parts = {"safety": SafetyLimits, "scale": ActionScale, "home": HomePath}
-    values = {}
-    for key, value in table.items():
-        if isinstance(value, dict):
-            values[key] = _build(parts[key], value, f"{where}.{key}")
-        else:
-            values[key] = tuple(value) if isinstance(value, list) else value
-    try:
-        return cls(**values)
-    except TypeError as error:
-        raise ConfigError(f"{where}: {error}") from error
-
-
 def load_rig(name_or_path: str) -> RigConfig:
     """A rig by name (hw/rigs/NAME.toml) or by path."""
     path = Path(name_or_path)
@@ -111,4 +92,4 @@ def load_rig(name_or_path: str) -> RigConfig:
         table = tomllib.loads(path.read_text())
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"rig file {path} is not valid TOML: {error}") from error
-    return _build(RigConfig, table, path.name)
+    return from_table(RigConfig, table, path.name)

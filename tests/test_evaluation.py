@@ -5,9 +5,9 @@ import json
 
 import pytest
 
-from far_app.config import RetryConfig
+from far_app.config import FCPAConfig, RetryConfig
 from far_app.errors import ConfigError
-from far_app.evaluation import Arm, EvaluationPlan, evaluate, read_results, run_scene
+from far_app.evaluation import Arm, EvaluationPlan, evaluate, read_arms, read_results, run_scene
 from far_app.types import Attempt, Judge, Outcome, Trial
 
 PLAN = EvaluationPlan(
@@ -61,3 +61,43 @@ def test_a_first_attempt_success_is_run_once():
     assert calls == ["m1"]
     assert [r["arm"] for r in records] == ["nr", "far"]
     assert records[1]["shared"]
+
+
+def written(folder, text):
+    path = folder / "arms.toml"
+    path.write_text(text)
+    return path
+
+
+def test_arms_from_a_file_differ_only_where_it_says(tmp_path):
+    plain, small = read_arms(written(tmp_path, """
+[[arm]]
+name = "nr"
+method = "nr"
+[[arm]]
+name = "far, smaller steps"
+method = "far"
+retry.fcpa = { lr = 2e-6, guard = "scale" }
+retry.perturbation.dims = [0, 1, 2]
+"""))  # fmt: skip
+    assert plain == Arm(name="nr", method="nr")
+    assert small.retry.fcpa == FCPAConfig(lr=2e-6, guard="scale")
+    assert small.retry.perturbation.dims == (0, 1, 2)
+    assert small.retry.pairs == RetryConfig().pairs
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[[arm]]\nname = 'a'\nmethod = 'nr'\nretry.fcpa.rate = 1", "unknown setting rate; known: .*lr"),
+        ("[[arm]]\nname = 'a'\nmethod = 'nr'\nretry.fcpa.lr = -1", "fcpa.lr is -1"),
+        ("[[arm]]\nname = 'a'\nmethod = 'nr'\nretry.fcpa = 3", "retry.fcpa is 3, must be a table"),
+        ("[[arm]]\nname = 'a'", "arm 1 has no method"),
+        ("[[arm]]\nname = 'a'\nmethod = 'nr'\n" * 2, "an arm twice"),
+        ("arm = 1", r"must list \[\[arm\]\]"),
+        ("[[arm", "not valid TOML"),
+    ],
+)
+def test_a_wrong_file_of_arms_is_named(tmp_path, text, says):
+    with pytest.raises(ConfigError, match=says):
+        read_arms(written(tmp_path, text))

@@ -39,6 +39,9 @@ class DemoOptions:
     """HDF5 file; datasets/TASK.hdf5 by default."""
     policy: Path | None = None
     """Record this policy's attempts instead of the expert's demonstrations."""
+    explore: float = 0.0
+    """With --policy: standard deviation of smoothed perturbations of the translation, in action units. A critic learns
+    from them what other actions would have led to."""
     rig: str = "twin"
 
 
@@ -50,7 +53,7 @@ def main(arguments: Sequence[str]) -> int:
     env_args = {
         "env_name": task.environment, "type": 1, "env_kwargs": {"robots": "XArm7", "rig": dataclasses.asdict(robot.rig)}
     }  # fmt: skip
-    attempt = policy_attempt(options.policy, task, robot) if options.policy is not None else None
+    attempt = policy_attempt(options.policy, task, robot, options.explore) if options.policy is not None else None
     scene = SEED_OFFSET + options.seed + last_scene(path)
     failures = 0
     with tqdm(total=options.n, initial=count_episodes(path), unit="demo") as bar:
@@ -74,12 +77,14 @@ def main(arguments: Sequence[str]) -> int:
 Recorded = tuple[list[Observation], list[np.ndarray], bool]
 
 
-def policy_attempt(checkpoint: Path, task: TaskConfig, robot: LockstepRobot) -> Callable[[int], Recorded]:
+def policy_attempt(
+    checkpoint: Path, task: TaskConfig, robot: LockstepRobot, explore: float
+) -> Callable[[int], Recorded]:
     """First attempts of a policy, by scene, in the form of `demonstrate`."""
     import torch
 
     from far_app.cli.assemble import assemble
-    from far_app.config import RetryConfig
+    from far_app.config import PerturbationConfig, RetryConfig
     from far_app.detectors import TwinCheck
     from far_app.session.lockstep import adapt_at_once, run_lockstep
     from far_app.session.planners import LockstepPlanner
@@ -87,7 +92,10 @@ def policy_attempt(checkpoint: Path, task: TaskConfig, robot: LockstepRobot) -> 
 
     torch.set_num_threads(1)
     once = dataclasses.replace(task, max_attempts=1)
-    method = assemble("dp", task, str(checkpoint), None, "cpu", RetryConfig()).method
+    exploration = PerturbationConfig(
+        kind="smoothed", probability=1.0, sigma=explore, dims=(0, 1, 2), first_attempt=1
+    )  # fmt: skip
+    method = assemble("perturb", task, str(checkpoint), None, "cpu", RetryConfig(perturbation=exploration)).method
 
     def attempt(scene: int) -> Recorded:
         events = trial(

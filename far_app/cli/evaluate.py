@@ -16,7 +16,17 @@ from far_app.cli.assemble import assemble, shipped
 from far_app.cli.lockstep_twin import lockstep_twin
 from far_app.config import RetryConfig
 from far_app.errors import RobotError
-from far_app.evaluation import DEV_SCENES, REPORT_SCENES, Arm, EvaluationPlan, Job, evaluate, read_results, run_scene
+from far_app.evaluation import (
+    DEV_SCENES,
+    REPORT_SCENES,
+    Arm,
+    EvaluationPlan,
+    Job,
+    evaluate,
+    read_arms,
+    read_results,
+    run_scene,
+)
 from far_app.protocols import Method, Resume
 from far_app.tasks import task as find_task
 from far_app.trial import Event
@@ -31,7 +41,11 @@ class EvaluationOptions:
 
     task: str = "lift"
     methods: tuple[str, ...] = ("nr", "perturb", "far")
+    arms: Path | None = None
+    """A TOML file of [[arm]] tables (name, method, settings that differ), instead of methods."""
     scenes: int = 200
+    first_scene: int | None = None
+    """Where the scenes begin; 20,000 by default, 30,000 with --report."""
     report: bool = False
     """Use the reporting scenes; without it the scenes kept for choices."""
     attempts: int = 5
@@ -51,10 +65,14 @@ def main(arguments: Sequence[str]) -> int:
     critic = options.critic or (
         policy.with_name("critic.safetensors") if options.policy else shipped(task.name, "critic")
     )
+    kind = REPORT_SCENES if options.report else DEV_SCENES
+    first = kind if options.first_scene is None else options.first_scene
     plan = EvaluationPlan(
         task=task.name, rig=options.rig, policy=str(policy), critic=str(critic),
-        arms=tuple(Arm(name=m, method=m, retry=options.retry) for m in options.methods),
-        first_scene=REPORT_SCENES if options.report else DEV_SCENES, scenes=options.scenes,
+        arms=read_arms(options.arms)
+        if options.arms
+        else tuple(Arm(name=m, method=m, retry=options.retry) for m in options.methods),
+        first_scene=first, scenes=options.scenes,
         max_attempts=options.attempts,
     )  # fmt: skip
     run_plan(options.out, plan, options.workers)

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -30,6 +31,12 @@ class TrainCriticOptions:
     """How many demonstrations to use; all by default."""
     iterations: int | None = None
     """Gradient steps; the paper's by default."""
+    reward: Literal["shaped", "sparse", "real"] = "shaped"
+    """How ticks are rewarded: the task's shaped reward − 1, 3 at completion, or the paper's labels on a real robot."""
+    encoder: Literal["shared", "own"] = "shared"
+    """See through the policy's frozen encoder, or train an own one that begins as its copy (far slower)."""
+    backup: int = 1
+    """Ticks of reward in Q's target before V takes over; 1 is the paper's, 8 a whole quickstart chunk."""
     seed: int = 0
     threads: int = 2
     """torch threads."""
@@ -46,7 +53,9 @@ def main(arguments: Sequence[str]) -> int:
     torch.set_num_threads(options.threads)
     path = options.policy or Path("runs") / f"{options.task}-quickstart" / "policy.safetensors"
     policy = load_policy(path, options.task)
-    training = CriticTraining(seed=options.seed)
+    training = CriticTraining(
+        seed=options.seed, reward=options.reward, encoder=options.encoder, backup=options.backup
+    )  # fmt: skip
     if options.iterations is not None:
         training = dataclasses.replace(training, iterations=options.iterations)
     cameras = policy.config.cameras

@@ -1,10 +1,11 @@
 """V(s) and Q(s, a): implicit Q-learning on the policy's features (paper, Conservative Value Estimation).
 
     L_V = E[ L₂^τ( min Q̄(s, a) − V(s) ) ],      L₂^τ(u) = |τ − 1(u < 0)| u²
-    L_Q = E[ ( r + γ (1 − done) V(s′) − Q(s, a) )² ],      a = a_{t:t+H−1}, r of the executed action, one tick
+    L_Q = E[ ( R + γ^n (1 − done) V(s_{t+n}) − Q(s, a) )² ],      a = a_{t:t+H−1}, R = Σ_{i<n} γ^i r_{t+i}
     Q̄  ← (1 − ρ) Q̄ + ρ Q
 
-V is one MLP, Q two on [features, flattened chunk]; done means success, never the time limit. Trained by
+n = 1 is the paper's; n = H looks at what the whole chunk led to. V is one MLP, Q two on [features, flattened chunk];
+done means success, never the time limit. Trained by
 train_critic.py; used for V(s_t) in every tick, for ΔV and for TopK.
 """
 
@@ -118,14 +119,13 @@ def iql_losses(
     chunks: Float[Tensor, "B H A"],
     rewards: Float[Tensor, "B"],
     next_features: Float[Tensor, "B F"],
-    done: Float[Tensor, "B"],
+    discounts: Float[Tensor, "B"],
     tau: float,
-    gamma: float,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """(L_V, L_Q) of a batch; done is 1 where the task was completed by this step."""
+    """(L_V, L_Q) of a batch; discounts are γ^n, 0 where the task was completed within those n ticks."""
     with torch.no_grad():
         slow = torch.minimum(*critic.twin_q(features, chunks, slow=True))
-        target = rewards + gamma * (1 - done) * critic.value(next_features)
+        target = rewards + discounts * critic.value(next_features)
     value_loss = expectile_loss(slow - critic.value(features), tau)
     q1, q2 = critic.twin_q(features, chunks)
     return value_loss, (target - q1).square().mean() + (target - q2).square().mean()

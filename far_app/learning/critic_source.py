@@ -16,10 +16,10 @@ from far_app.learning.critic import Critic
 from far_app.learning.dataset import Episode
 from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.segments import segment_features
-from far_app.learning.transitions import EncodedEpisode, RewardKind, Transitions, joined, transitions
+from far_app.learning.transitions import Backup, EncodedEpisode, RewardKind, Transitions, joined, transitions
 
 Batch = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Features (B, F), chunks (B, H, A), rewards (B,), next features (B, F), done (B,)."""
+"""Features (B, F), chunks (B, H, A), rewards (B,), next features (B, F), discounts (B,)."""
 
 
 class Source(Protocol):
@@ -55,8 +55,8 @@ class Features:
     def __init__(self, data: Transitions) -> None:
         if not len(data):
             raise ConfigError("no transitions to train a critic on")
-        arrays = (data.features, data.chunks, data.rewards, data.next_features, data.done)
-        self.features, self.chunks, self.rewards, self.next_features, self.done = (
+        arrays = (data.features, data.chunks, data.rewards, data.next_features, data.discounts)
+        self.features, self.chunks, self.rewards, self.next_features, self.discounts = (
             torch.from_numpy(np.ascontiguousarray(a)) for a in arrays
         )
 
@@ -65,47 +65,52 @@ class Features:
 
     def batch(self, critic: Critic, rows: Int[np.ndarray, "B"]) -> Batch:
         at = torch.from_numpy(rows)
-        return self.features[at], self.chunks[at], self.rewards[at], self.next_features[at], self.done[at]
+        return self.features[at], self.chunks[at], self.rewards[at], self.next_features[at], self.discounts[at]
 
 
 class Pictures:
     """Transitions seen through the critic's own eyes, gradients included; all pictures are held in memory."""
 
-    def __init__(self, episodes: Sequence[Episode], horizon: int, reward: RewardKind) -> None:
+    def __init__(self, episodes: Sequence[Episode], horizon: int, reward: RewardKind, backup: Backup) -> None:
         starts = np.cumsum([0, *(len(e) for e in episodes)])
         self.first = np.repeat(starts[:-1], [len(e) for e in episodes])
         """Row of the first tick of each row's episode."""
         self.images = {c: np.concatenate([e.images[c] for e in episodes]) for c in episodes[0].images}
         self.states = np.concatenate([e.states for e in episodes])
         numbered = [
-            transitions(with_features(e, np.arange(start, start + len(e))[:, None]), horizon, reward)
+            transitions(with_features(e, np.arange(start, start + len(e))[:, None]), horizon, reward, backup)
             for e, start in zip(episodes, starts[:-1], strict=True)
             if len(e) > 1
         ]
         self.table = Features(joined(numbered))
-        """Transitions whose features are the row numbers of s_t and s_{t+1}."""
+        """Transitions whose features are the row numbers of s_t and s_{t+n}."""
 
     def __len__(self) -> int:
         return len(self.table)
 
     def batch(self, critic: Critic, rows: Int[np.ndarray, "B"]) -> Batch:
         assert critic.eyes is not None, "pictures need a critic with eyes"
-        now, chunks, rewards, _, done = self.table.batch(critic, rows)
-        now = now[:, 0].long().numpy()
-        n_obs = critic.eyes.config.n_obs
-        frames = np.maximum(now[:, None] + np.arange(1 - n_obs, 2), self.first[now][:, None])
-        images = {c: torch.from_numpy(self.images[c][frames]) for c in critic.eyes.config.cameras}
-        features = segment_features(critic.eyes, images, torch.from_numpy(self.states[frames])).unflatten(0, (-1, 2))
-        return features[:, 0], chunks, rewards, features[:, 1], done
+        now, chunks, rewards, later, discounts = self.table.batch(critic, rows)
+        return self._seen(critic.eyes, now), chunks, rewards, self._seen(critic.eyes, later), discounts
+
+    def _seen(self, eyes: DiffusionPolicy, numbers: Tensor) -> Tensor:
+        at = numbers[:, 0].long().numpy()
+        frames = np.maximum(at[:, None] + np.arange(1 - eyes.config.n_obs, 1), self.first[at][:, None])
+        images = {c: torch.from_numpy(self.images[c][frames]) for c in eyes.config.cameras}
+        return segment_features(eyes, images, torch.from_numpy(self.states[frames]))
 
 
 def policy_features(
-    policy: DiffusionPolicy, demonstrations: Sequence[Episode], attempts: Sequence[Episode], reward: RewardKind
+    policy: DiffusionPolicy,
+    demonstrations: Sequence[Episode],
+    attempts: Sequence[Episode],
+    reward: RewardKind,
+    backup: Backup,
 ) -> tuple[Transitions, int]:
     """D_exp ∪ D_succ ∪ D_fail through the policy's encoder, and how many of the first rows are demonstrations."""
     if not demonstrations:
         raise ConfigError("no demonstrations to train a critic on; make some with `far demo`")
     episodes = tqdm([*demonstrations, *attempts], unit="episode", desc="features", leave=False)
-    parts = [transitions(encoded(policy, e), policy.config.horizon, reward) for e in episodes if len(e) > 1]
+    parts = [transitions(encoded(policy, e), policy.config.horizon, reward, backup) for e in episodes if len(e) > 1]
     shown = sum(len(p) for p in parts[: sum(len(e) > 1 for e in demonstrations)])
     return joined(parts), shown

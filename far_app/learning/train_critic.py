@@ -29,7 +29,7 @@ from far_app.learning.dataset import Episode
 from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.preference import Demonstrations
 from far_app.learning.resume import load_state, optimizer_tensors, restore_optimizer, save_state
-from far_app.learning.transitions import RewardKind
+from far_app.learning.transitions import Backup, RewardKind
 from far_app.seeding import generator
 
 log = logging.getLogger(__name__)
@@ -52,6 +52,9 @@ class CriticTraining:
     """τ."""
     gamma: float = 0.99
     """γ, one tick."""
+    backup: int = 1
+    """Ticks of reward in Q's target before V takes over: 1 is the paper's, H (the chunk's horizon) shows Q what the
+    whole chunk led to."""
     polyak: float = 0.005
     """ρ of the target networks."""
     reward: RewardKind = "shaped"
@@ -68,6 +71,8 @@ class CriticTraining:
             raise ConfigError(f"expectile is {self.expectile}, must be between 0 and 1")
         if not 0 <= self.gamma <= 1:
             raise ConfigError(f"gamma is {self.gamma}, must be in [0, 1]")
+        if self.backup < 1:
+            raise ConfigError(f"backup is {self.backup}, must be at least 1 tick")
 
 
 def fit(critic: Critic, source: Source, training: CriticTraining, folder: Path, stamp: str = "") -> dict[str, float]:
@@ -90,7 +95,7 @@ def fit(critic: Critic, source: Source, training: CriticTraining, folder: Path, 
     bar = tqdm(range(done, training.iterations), initial=done, total=training.iterations, unit="it", desc="critic")
     for iteration in bar:
         rows = generator("critic", training.seed, iteration).integers(len(source), size=training.batch)
-        value_loss, q_loss = iql_losses(critic, *source.batch(critic, rows), training.expectile, training.gamma)
+        value_loss, q_loss = iql_losses(critic, *source.batch(critic, rows), training.expectile)
         optimizer.zero_grad(set_to_none=True)
         (value_loss + q_loss).backward()
         optimizer.step()
@@ -152,14 +157,15 @@ def train_critic(
     policy's own rollouts, failed and successful: trained on successes alone, V knows little of failure."""
     torch.manual_seed(training.seed)
     started = time.monotonic()
-    data, shown = policy_features(policy, demonstrations, attempts, training.reward)
+    backup = Backup(ticks=training.backup, gamma=training.gamma)
+    data, shown = policy_features(policy, demonstrations, attempts, training.reward, backup)
     own = training.encoder == "own"
     shape = CriticShape(
         features=policy.feature_dim, horizon=policy.config.horizon, action_dim=data.chunks.shape[2],
         hidden=training.hidden, own_eyes=own,
     )  # fmt: skip
     critic = Critic(shape, eyes_of(policy).requires_grad_(True) if own else None)
-    source = Pictures([*demonstrations, *attempts], shape.horizon, training.reward) if own else Features(data)
+    source = Pictures([*demonstrations, *attempts], shape.horizon, training.reward, backup) if own else Features(data)
     means = fit(critic, source, training, folder, stamp=encoder_fingerprint(policy))
     kept = generator("demonstration chunks", training.seed).permutation(shown)[:KEPT_CHUNKS]
     expert = Demonstrations(features=torch.from_numpy(data.features[kept]), chunks=torch.from_numpy(data.chunks[kept]))

@@ -1,4 +1,4 @@
-"""Episodes as IQL transitions, in plain arrays: (features, chunk, reward, next features, done).
+"""Episodes as IQL transitions, in plain arrays: (features, chunk, reward, next features, discount), over n ticks.
 
 Rewards are labelled here, by kind:
     shaped   r − 1 from the environment's shaped reward in [0, 1]: in [−1, 0], 0 at completion
@@ -39,8 +39,11 @@ class Transitions:
     features: Float[np.ndarray, "N F"]
     chunks: Float[np.ndarray, "N H A"]
     rewards: Float[np.ndarray, "N"]
+    """Σ_{i<n} γ^i r_{t+i}."""
     next_features: Float[np.ndarray, "N F"]
-    done: Float[np.ndarray, "N"]
+    """Of s_{t+n}."""
+    discounts: Float[np.ndarray, "N"]
+    """γ^n; 0 where the task was completed within those n ticks."""
 
     def __len__(self) -> int:
         return len(self.rewards)
@@ -60,16 +63,31 @@ def chunked(actions: Float[np.ndarray, "T A"], horizon: int) -> Float[np.ndarray
     return actions[index]
 
 
-def transitions(episode: EncodedEpisode, horizon: int, kind: RewardKind) -> Transitions:
+@dataclass(frozen=True, kw_only=True)
+class Backup:
+    """How far Q's target looks ahead before it asks V."""
+
+    ticks: int = 1
+    """n; fewer at an episode's end. 1 is the paper's (its Eq. for Q)."""
+    gamma: float = 0.99
+    """γ, one tick."""
+
+
+def transitions(episode: EncodedEpisode, horizon: int, kind: RewardKind, backup: Backup) -> Transitions:
     """One episode's transitions, up to its completion if it has one: what follows success is nobody's business."""
     steps = len(episode.actions)
     first = int(np.argmax(episode.success)) + 1 if episode.success.any() else steps
     chunks = chunked(episode.actions, horizon)[:first]
     rewards = labelled(kind, episode.rewards, episode.success)[:first]
+    padded = np.append(rewards, np.zeros(backup.ticks))
+    gained = sum((backup.gamma**i * padded[i : i + first] for i in range(backup.ticks)), np.zeros(first))
+    ends = np.minimum(np.arange(first) + backup.ticks, first)
+    discounts = np.where(episode.success[ends - 1], 0.0, backup.gamma ** (ends - np.arange(first)))
     return Transitions(
         features=episode.features[:first].astype(np.float32), chunks=chunks.astype(np.float32),
-        rewards=rewards.astype(np.float32), next_features=episode.features[1 : first + 1].astype(np.float32),
-        done=episode.success[:first].astype(np.float32),
+        rewards=gained.astype(np.float32),
+        next_features=episode.features[ends].astype(np.float32),
+        discounts=discounts.astype(np.float32),
     )  # fmt: skip
 
 
@@ -79,5 +97,5 @@ def joined(parts: Sequence[Transitions]) -> Transitions:
         chunks=np.concatenate([p.chunks for p in parts]),
         rewards=np.concatenate([p.rewards for p in parts]),
         next_features=np.concatenate([p.next_features for p in parts]),
-        done=np.concatenate([p.done for p in parts]),
+        discounts=np.concatenate([p.discounts for p in parts]),
     )

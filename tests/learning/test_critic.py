@@ -12,7 +12,7 @@ from far_app.learning.critic_file import load_critic, load_demonstrations, read_
 from far_app.learning.critic_source import Features, Pictures, encoded
 from far_app.learning.dataset import Episode
 from far_app.learning.train_critic import CriticTraining, fit, train_critic
-from far_app.learning.transitions import EncodedEpisode, Transitions, chunked, joined, labelled, transitions
+from far_app.learning.transitions import Backup, EncodedEpisode, Transitions, chunked, joined, labelled, transitions
 from tests.learning.small import SIZE, small_attempt, small_policy
 
 SHAPE = CriticShape(features=3, horizon=2, action_dim=2, hidden=(32,))
@@ -50,7 +50,7 @@ def test_the_losses_are_iqls():
     critic = Critic(SHAPE)
     s, a, s2 = torch.randn(4, 3), torch.randn(4, 2, 2), torch.randn(4, 3)
     r, done = torch.tensor([-1.0, -0.5, 0.0, 3.0]), torch.tensor([0.0, 0.0, 1.0, 1.0])
-    value_loss, q_loss = iql_losses(critic, s, a, r, s2, done, tau=0.7, gamma=0.9)
+    value_loss, q_loss = iql_losses(critic, s, a, r, s2, 0.9 * (1 - done), tau=0.7)
     v2 = critic.value(s2)
     target = torch.stack([r[0] + 0.9 * v2[0], r[1] + 0.9 * v2[1], r[2], r[3]])
     q1, q2 = critic.twin_q(s, a)
@@ -63,7 +63,7 @@ def test_the_losses_are_iqls():
 def test_each_loss_moves_its_own_networks_only():
     critic = Critic(SHAPE)
     batch = torch.randn(4, 3), torch.randn(4, 2, 2), torch.zeros(4), torch.randn(4, 3), torch.zeros(4)
-    value_loss, q_loss = iql_losses(critic, *batch, tau=0.7, gamma=0.9)
+    value_loss, q_loss = iql_losses(critic, *batch, tau=0.7)
     value_loss.backward(retain_graph=True)
     assert all(p.grad is None for p in [*critic.q1.parameters(), *critic.slow_q1.parameters()])
     critic.zero_grad()
@@ -99,8 +99,8 @@ def test_an_episode_ends_where_it_succeeds_and_only_there_it_is_done():
         features=np.arange(6.0)[:, None], actions=np.zeros((5, 2)), rewards=np.linspace(0, 1, 5),
         success=np.array([False, False, True, True, False]),
     )  # fmt: skip
-    found = transitions(episode, 2, "sparse")
-    assert found.done.tolist() == [0, 0, 1]
+    found = transitions(episode, 2, "sparse", Backup())
+    assert found.discounts.tolist() == pytest.approx([0.99, 0.99, 0])
     assert found.rewards.tolist() == [0, 0, 3]
     assert found.next_features[:, 0].tolist() == [1, 2, 3]
 
@@ -109,9 +109,30 @@ def test_a_time_limit_is_not_an_end():
     episode = EncodedEpisode(
         features=np.zeros((6, 1)), actions=np.zeros((5, 2)), rewards=np.zeros(5), success=np.zeros(5, bool)
     )
-    found = transitions(episode, 2, "shaped")
+    found = transitions(episode, 2, "shaped", Backup())
     assert len(found) == 5
-    assert not found.done.any()
+    assert found.discounts.all()
+
+
+def test_a_longer_backup_adds_up_rewards_and_asks_v_further_on():
+    """By hand: n = 2, γ = ½, success at the third tick."""
+    episode = EncodedEpisode(
+        features=np.arange(5.0)[:, None], actions=np.zeros((4, 2)), rewards=np.array([0.2, 0.4, 1.0, 1.0]),
+        success=np.array([False, False, True, True]),
+    )  # fmt: skip
+    found = transitions(episode, 2, "shaped", Backup(ticks=2, gamma=0.5))
+    assert found.rewards.tolist() == pytest.approx([-0.8 + 0.5 * -0.6, -0.6, 0.0])
+    assert found.next_features[:, 0].tolist() == [2, 3, 3]
+    assert found.discounts.tolist() == [0.25, 0, 0]
+
+
+def test_a_backup_is_cut_at_the_time_limit_and_v_asked_there():
+    episode = EncodedEpisode(
+        features=np.arange(4.0)[:, None], actions=np.zeros((3, 2)), rewards=np.zeros(3), success=np.zeros(3, bool)
+    )
+    found = transitions(episode, 2, "shaped", Backup(ticks=2, gamma=0.5))
+    assert found.rewards.tolist() == [-1.5, -1.5, -1]
+    assert found.discounts.tolist() == [0.25, 0.25, 0.5]
 
 
 def corridor(cells: int = 6, repeats: int = 40) -> Transitions:
@@ -121,13 +142,13 @@ def corridor(cells: int = 6, repeats: int = 40) -> Transitions:
     done = (i == cells - 1).astype(np.float32)
     return Transitions(
         features=one_hot[i], chunks=np.zeros((len(i), 2, 2), np.float32), rewards=-(1 - done),
-        next_features=one_hot[i + 1], done=done,
+        next_features=one_hot[i + 1], discounts=(0.9 * (1 - done)).astype(np.float32),
     )  # fmt: skip
 
 
 def test_training_finds_the_value_of_a_corridor(tmp_path):
     critic = Critic(CriticShape(features=7, horizon=2, action_dim=2, hidden=(64,)))
-    training = CriticTraining(iterations=2500, lr=2e-3, gamma=0.9, polyak=0.05, expectile=0.7)
+    training = CriticTraining(iterations=2500, lr=2e-3, polyak=0.05, expectile=0.7)
     fit(critic, Features(corridor()), training, tmp_path)
     with torch.no_grad():
         found = critic.value(torch.eye(7)[:6])
@@ -231,8 +252,8 @@ def test_pictures_are_the_same_transitions_as_features():
     """Before any training an own encoder is the policy's: both sources give the same batch."""
     policy, episodes = small_policy(), [episode(9, True), episode(7, False, seed=1)]
     critic = Critic(CriticShape(features=policy.feature_dim, horizon=8, action_dim=7, own_eyes=True), eyes_of(policy))
-    features = Features(joined([transitions(encoded(policy, e), 8, "shaped") for e in episodes]))
-    pictures = Pictures(episodes, 8, "shaped")
+    features = Features(joined([transitions(encoded(policy, e), 8, "shaped", Backup()) for e in episodes]))
+    pictures = Pictures(episodes, 8, "shaped", Backup())
     assert len(pictures) == len(features) == 14
     rows = np.array([0, 7, 8, 13, 3])
     for one, other in zip(features.batch(critic, rows), pictures.batch(critic, rows), strict=True):
