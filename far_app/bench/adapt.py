@@ -20,6 +20,7 @@ import tyro
 from far_app.bench.loop import Unlearning, naive_session
 from far_app.bench.report import write
 from far_app.cli.options import RunOptions
+from far_app.cli.settings import recommended
 from far_app.cli.stage import stage
 from far_app.errors import ConfigError
 from far_app.session.adaptation import BackgroundAdaptation
@@ -62,6 +63,7 @@ def measure(options: AdaptOptions) -> dict[str, Any]:
         run = RunOptions(
             seed=options.seed, policy=options.policy, critic=options.critic, method="far", headless=True, rerun=False,
             torch_threads=options.torch_threads, recordings=Path(recordings),
+            retry=recommended(RunOptions.task, options.policy),
         )  # fmt: skip
         with stage(run) as stage_:
             method = stage_.parts.method

@@ -23,6 +23,7 @@ import tyro
 
 from far_app.bench.report import write
 from far_app.cli.options import RunOptions
+from far_app.cli.settings import recommended
 from far_app.cli.stage import Stage, stage
 from far_app.errors import ConfigError, FarError
 from far_app.protocols import Method
@@ -70,6 +71,7 @@ def measure(options: LoopOptions) -> dict[str, Any]:
         run = RunOptions(
             seed=options.seed, policy=options.policy, critic=options.critic, port=options.port, method="far",
             headless=not options.page, rerun=False, torch_threads=options.torch_threads, recordings=Path(recordings),
+            retry=recommended(RunOptions.task, options.policy),
         )  # fmt: skip
         with stage(run) as stage_, client(stage_.page_url, options.seconds) as connected:
             half = options.seconds / 2

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import tyro
 from tqdm import tqdm
 
 from far_app.cli.assemble import assemble, shipped
 from far_app.cli.lockstep_twin import lockstep_twin
+from far_app.cli.settings import Settings, parse
 from far_app.config import RetryConfig
 from far_app.errors import RobotError
 from far_app.evaluation import (
@@ -55,11 +55,13 @@ class EvaluationOptions:
     rig: str = "twin"
     workers: int = 2
     out: Path = Path("runs/eval")
+    settings: Settings = "model"
+    """Begin from what the checkpoint's makers recommend (the retry.toml beside it), or from the paper's settings."""
     retry: RetryConfig = field(default_factory=RetryConfig)
 
 
 def main(arguments: Sequence[str]) -> int:
-    options = tyro.cli(EvaluationOptions, args=list(arguments), prog="far eval")
+    options = parse(EvaluationOptions, arguments, "far eval")
     task = find_task(options.task)
     policy = options.policy or shipped(task.name, "policy")
     critic = options.critic or (

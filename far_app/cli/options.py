@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from far_app.cli.settings import Settings
 from far_app.config import RetryConfig
 from far_app.errors import ConfigError
 
@@ -46,6 +47,8 @@ class RunOptions:
     """Folder of the sessions."""
     torch_threads: int = 1
     """Threads of one torch operation in the loop's process."""
+    settings: Settings = "model"
+    """Begin from what the checkpoint's makers recommend (the retry.toml beside it), or from the paper's settings."""
     retry: RetryConfig = field(default_factory=RetryConfig)
     """Settings of the method."""
     verbose: bool = False

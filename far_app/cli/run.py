@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from far_app.cli.options import RunOptions
+from far_app.cli.settings import parse
 from far_app.cli.stage import stage
 from far_app.endpoints import Endpoints
 from far_app.errors import ConfigError
@@ -25,7 +24,7 @@ from far_app.session_states import Intent
 
 
 def main(arguments: Sequence[str]) -> int:
-    options = tyro.cli(RunOptions, args=list(arguments), prog="far run")
+    options = parse(RunOptions, arguments, "far run")
     logging.basicConfig(
         level=logging.INFO if options.verbose else logging.WARNING,
         format="%(asctime)s %(levelname)s %(name)s: %(message)s",

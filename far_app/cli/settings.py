@@ -1,0 +1,47 @@
+"""Which settings of retrying a command begins from: those that the checkpoint's makers measured, or the paper's.
+
+A policy NAMEpolicy.safetensors may have a NAMEretry.toml beside it, with what measured best for it; everything else is
+the paper's value, and an option given on the command line comes before both.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import tyro
+
+from far_app.cli.assemble import UNTRAINED, shipped
+from far_app.config import RetryConfig, from_table
+from far_app.errors import ConfigError
+
+Settings = Literal["model", "paper"]
+Options = TypeVar("Options")
+
+
+def recommended(task: str, policy: str | Path | None) -> RetryConfig:
+    """What lies beside a checkpoint (the shipped one by default); the paper's settings where nothing does."""
+    if policy is not None and str(policy).startswith((UNTRAINED, "test:")):
+        return RetryConfig()
+    checkpoint = Path(policy) if policy is not None else shipped(task, "policy")
+    path = checkpoint.with_name(checkpoint.name.removesuffix("policy.safetensors") + "retry.toml")
+    if not path.exists():
+        return RetryConfig()
+    try:
+        return from_table(RetryConfig, tomllib.loads(path.read_text()), path.name)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path} is not valid TOML: {error}") from error
+
+
+def parse(options: type[Options], arguments: Sequence[str], prog: str) -> Options:
+    """Options with the fields task, policy, settings and retry from the command line; what it does not say of retry
+    comes from the chosen settings."""
+    given: Any = tyro.cli(options, args=list(arguments), prog=prog)
+    if given.settings == "paper":
+        return given
+    found = recommended(given.task, given.policy)
+    return given if found == RetryConfig() else tyro.cli(
+        options, args=list(arguments), prog=prog, default=options(retry=found)  # type: ignore[call-arg]
+    )  # fmt: skip

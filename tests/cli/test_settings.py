@@ -1,0 +1,39 @@
+"""What a checkpoint recommends is where a command begins; the command line has the last word."""
+
+import pytest
+
+from far_app.cli.options import RunOptions
+from far_app.cli.settings import parse, recommended
+from far_app.config import FCPAConfig, RetryConfig
+from far_app.errors import ConfigError
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    (tmp_path / "retry.toml").write_text('[fcpa]\nlr = 2e-6\nguard = "scale"\n')
+    return str(tmp_path / "policy.safetensors")
+
+
+def test_the_models_settings_come_first_and_the_command_line_last(checkpoint):
+    options = parse(RunOptions, ["--policy", checkpoint, "--retry.fcpa.guard", "stop", "--trials", "3"], "far run")
+    assert options.retry == RetryConfig(fcpa=FCPAConfig(lr=2e-6, guard="stop"))
+    assert options.trials == 3
+
+
+def test_the_papers_settings_are_one_option_away(checkpoint):
+    options = parse(RunOptions, ["--policy", checkpoint, "--settings", "paper"], "far run")
+    assert options.retry == RetryConfig()
+
+
+def test_a_checkpoint_without_a_recommendation_begins_from_the_papers(tmp_path):
+    assert recommended("lift", tmp_path / "policy.safetensors") == RetryConfig()
+    assert recommended("lift", "untrained:paper") == RetryConfig()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"), [("[fcpa]\nrate = 1", "retry.toml.fcpa: unknown setting rate"), ("[", "TOML")]
+)
+def test_a_wrong_recommendation_is_named(tmp_path, text, says):
+    (tmp_path / "retry.toml").write_text(text)
+    with pytest.raises(ConfigError, match=says):
+        recommended("lift", tmp_path / "policy.safetensors")
