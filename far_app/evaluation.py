@@ -7,6 +7,7 @@ identical for every method: a scene solved at the first attempt is solved for al
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import multiprocessing
 import time
@@ -52,10 +53,16 @@ class EvaluationPlan:
     max_attempts: int
 
     def fingerprint(self) -> dict[str, Any]:
-        """Everything but the number of scenes, which may grow."""
+        """Everything but the number of scenes, which may grow; checkpoints by name and content, not by place."""
         record = json.loads(json.dumps(dataclasses.asdict(self)))
         record.pop("scenes")
-        return record
+        return record | {"policy": identity(self.policy), "critic": identity(self.critic)}
+
+
+def identity(path: str) -> str:
+    """A checkpoint's name and the beginning of its checksum; the words themselves where there is no such file."""
+    file = Path(path)
+    return f"{file.name} sha256:{hashlib.sha256(file.read_bytes()).hexdigest()[:16]}" if file.is_file() else path
 
 
 def read_arms(path: Path) -> tuple[Arm, ...]:

@@ -101,3 +101,14 @@ retry.perturbation.dims = [0, 1, 2]
 def test_a_wrong_file_of_arms_is_named(tmp_path, text, says):
     with pytest.raises(ConfigError, match=says):
         read_arms(written(tmp_path, text))
+
+
+def test_results_go_on_wherever_the_checkpoints_lie_but_not_with_others(tmp_path):
+    for folder, weights in (("here", b"1"), ("there", b"1"), ("other", b"2")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "policy.safetensors").write_bytes(weights)
+    here, there, other = (
+        dataclasses.replace(PLAN, policy=str(tmp_path / f / "policy.safetensors")) for f in ("here", "there", "other")
+    )
+    assert here.fingerprint() == there.fingerprint() != other.fingerprint()
+    assert str(tmp_path) not in json.dumps(here.fingerprint())

@@ -23,8 +23,8 @@ class TrainCriticOptions:
     """Checkpoint of the policy whose encoder the critic sees through; runs/TASK-quickstart's by default."""
     data: Path | None = None
     """Demonstrations (robomimic HDF5); datasets/TASK.hdf5 by default."""
-    attempts: Path | None = None
-    """The policy's own rollouts, failed and successful (robomimic HDF5)."""
+    attempts: tuple[Path, ...] = ()
+    """The policy's own rollouts, failed and successful (robomimic HDF5 files)."""
     out: Path | None = None
     """Folder of the run: checkpoint, state to go on from, log; the policy's by default."""
     demonstrations: int | None = None
@@ -61,7 +61,8 @@ def main(arguments: Sequence[str]) -> int:
     cameras = policy.config.cameras
     data = options.data or Path("datasets") / f"{options.task}.hdf5"
     demonstrations = read_episodes(data, cameras, options.demonstrations)
-    attempts = read_episodes(options.attempts, cameras) if options.attempts is not None else []
-    checkpoint = train_critic(demonstrations, attempts, policy, training, options.out or path.parent)
+    attempts = [episode for file in options.attempts for episode in read_episodes(file, cameras)]
+    card: dict[str, object] = {"command": "far train critic " + " ".join(arguments)}
+    checkpoint = train_critic(demonstrations, attempts, policy, training, options.out or path.parent, card)
     log.info("wrote %s", checkpoint)
     return 0
