@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -31,6 +31,7 @@ class InferOptions:
     presets: tuple[str, ...] = ("quickstart", "paper")
     calls: int = 200
     device: str = "cpu"
+    engine: Literal["auto", "torch", "openvino"] = "auto"
     torch_threads: int = 1
     """Threads of one torch operation; the loop's process has 1."""
     json: Path | None = None
@@ -46,14 +47,16 @@ def main(arguments: Sequence[str]) -> int:
     import torch
 
     from far_app.cli.assemble import check_device, untrained
+    from far_app.learning.engines import chosen
     from far_app.learning.runtime import ActingPolicy
 
     check_device(options.device)
     torch.set_num_threads(options.torch_threads)
-    report: dict[str, Any] = {"device": options.device, "torch_threads": options.torch_threads}
+    engine = chosen(options.engine) if options.device == "cpu" else "torch"
+    report: dict[str, Any] = {"device": options.device, "engine": engine, "torch_threads": options.torch_threads}
     for preset in options.presets:
         network, critic = untrained(preset, "lift", options.device)
-        late = milliseconds(ActingPolicy(network, "bench", critic), options.calls)
+        late = milliseconds(ActingPolicy(network, "bench", critic, options.engine), options.calls)
         report[preset] = {k: v for k, v in percentiles(late).items() if k in ("p50", "p99")}
     write(report, options.json)
     return 0

@@ -13,6 +13,7 @@ from far_app.types import Observation
 
 if TYPE_CHECKING:
     from far_app.learning.critic import Critic
+    from far_app.learning.engines import Engine
     from far_app.learning.policy import DiffusionPolicy
 
 UNTRAINED = "untrained:"
@@ -38,7 +39,13 @@ def shipped(task: str, kind: str) -> Path:
 
 
 def assemble(
-    method: str, task: TaskConfig, policy: str | None, critic: Path | None, device: str, retry: RetryConfig
+    method: str,
+    task: TaskConfig,
+    policy: str | None,
+    critic: Path | None,
+    device: str,
+    retry: RetryConfig,
+    engine: Engine = "auto",
 ) -> Parts:
     """Load what a method needs and warm it up. Raises ConfigError or CheckpointError."""
     if policy is not None and policy.startswith("test:"):
@@ -70,7 +77,7 @@ def assemble(
         method,
         Ingredients(
             network=network, critic=critic_network, config=retry, demonstrations=demonstrations,
-            act=lambda net, version: ActingPolicy(net, version, critic_network),
+            act=lambda net, version: ActingPolicy(net, version, critic_network, engine),
         ),
     )  # fmt: skip
     return Parts(method=made, policy_name=name, max_attempts=entry.attempts)

@@ -47,6 +47,7 @@ def main(arguments: Sequence[str]) -> int:
         ("CPU", cpu),
         ("GPU", gpu),
         ("torch", torch_device),
+        ("engine", engine),
         ("GL", graphics),
         ("timer", timer),
         ("disk", lambda: disk(options.recordings)),
@@ -125,6 +126,20 @@ def torch_device() -> Finding:
 
     device = f"cuda: {torch.cuda.get_device_name(0)}" if torch.cuda.is_available() else "cpu"
     return Finding(good=True, text=f"{torch.__version__}, device {device}, {torch.get_num_threads()} threads")
+
+
+def engine() -> Finding:
+    from far_app.learning import engines, openvino_unet
+
+    if openvino_unet.available():
+        version = importlib.metadata.version("openvino")
+        return Finding(
+            good=True, text=f"a run on this CPU takes {engines.chosen()} {version}; --engine torch overrides"
+        )
+    return Finding(
+        good=True, text="a run on this CPU takes torch; OpenVINO is not installed",
+        advice="pip install openvino makes inference about twice as fast",
+    )  # fmt: skip
 
 
 def graphics() -> Finding:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from far_app.cli.settings import Settings
 from far_app.config import RetryConfig
@@ -33,6 +34,8 @@ class RunOptions:
     """Critic checkpoint; the one beside the policy by default."""
     device: str = "cpu"
     """cpu or cuda."""
+    engine: Literal["auto", "torch", "openvino"] = "auto"
+    """What runs the policy on a CPU; auto takes OpenVINO where it is installed, and torch, the reference, elsewhere."""
     max_attempts: int | None = None
     """Attempts a trial; the task's by default."""
     port: int = 8080

@@ -106,7 +106,9 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         stack.callback(family.end)
         hardware = family.add(start_hardware(folder, options.rig, options.task))
         page = None if options.headless else family.add(start_page(folder, options, port))
-        parts = assemble(options.method, task, options.policy, options.critic, options.device, options.retry)
+        parts = assemble(
+            options.method, task, options.policy, options.critic, options.device, options.retry, options.engine
+        )
         task = dataclasses.replace(task, max_attempts=options.max_attempts or parts.max_attempts or task.max_attempts)
         # From here on this process's threads come before the machine's others: one that is not scheduled while it holds
         # the interpreter would keep the loop waiting. The processes above were started before, at the usual priority.

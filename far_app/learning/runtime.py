@@ -17,8 +17,8 @@ from torch import Tensor
 from far_app.errors import PolicyError
 from far_app.learning.critic import Critic
 from far_app.learning.diffusion import ddim_sample
+from far_app.learning.engines import Engine, runner
 from far_app.learning.policy import DiffusionPolicy, proprioception
-from far_app.learning.trainable import trainable
 from far_app.protocols import History, PolicySpec
 from far_app.types import ActionChunk, Observation
 
@@ -29,11 +29,13 @@ KEPT_FRAMES = 64
 class ActingPolicy:
     """far_app.protocols.Policy for one version of the weights. Not for several threads at once."""
 
-    def __init__(self, network: DiffusionPolicy, version: str, critic: Critic | None = None) -> None:
+    def __init__(
+        self, network: DiffusionPolicy, version: str, critic: Critic | None = None, engine: Engine = "auto"
+    ) -> None:
         self.network, self.critic, self.version = network, critic, version
         self.spec: PolicySpec = network.spec()
         self.device = network.normalizer.low.device
-        self._denoiser = trainable(network.denoiser, network.config.horizon, train=False)
+        self._denoiser = runner(network.denoiser, network.config.horizon, engine)
         self._kept: OrderedDict[int, tuple[Observation, list[Tensor]]] = OrderedDict()
 
     def plan(
