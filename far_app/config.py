@@ -143,6 +143,25 @@ class PerturbationConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ResamplingConfig:
+    """Retries that act otherwise without an update (bgr; beyond the paper rerank and negative-guidance)."""
+
+    samples: int = 16
+    """N, chunks drawn where a choice is made (paper, Baselines: 16 for DP-BGR)."""
+    radius_percentile: float = 90.0
+    """How near a state must be to a failed one: this percentile of the distances between the demonstrations' states
+    and their nearest others, in feature space (the paper's threshold is not told)."""
+    repulsion: float = 0.3
+    """w of negative-guidance: how far each denoising step is pushed from the failed chunk, action units over the whole
+    chunk."""
+
+    def __post_init__(self) -> None:
+        _check(self.samples >= 1, "resampling.samples", self.samples, "at least 1")
+        _check(0 < self.radius_percentile <= 100, "resampling.radius_percentile", self.radius_percentile, "in (0, 100]")
+        _check(self.repulsion >= 0, "resampling.repulsion", self.repulsion, "at least 0")
+
+
+@dataclass(frozen=True, kw_only=True)
 class RetryConfig:
     """One method of retrying, whole."""
 
@@ -150,6 +169,7 @@ class RetryConfig:
     pairs: PairsConfig = field(default_factory=PairsConfig)
     fcpa: FCPAConfig = field(default_factory=FCPAConfig)
     perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)
+    resampling: ResamplingConfig = field(default_factory=ResamplingConfig)
     adaptation_limit: float = 60.0
     """Seconds after which a retry no longer waits for its adaptation."""
 

@@ -53,10 +53,29 @@ class EvaluationPlan:
     max_attempts: int
 
     def fingerprint(self) -> dict[str, Any]:
-        """Everything but the number of scenes, which may grow; checkpoints by name and content, not by place."""
-        record = json.loads(json.dumps(dataclasses.asdict(self)))
-        record.pop("scenes")
-        return record | {"policy": identity(self.policy), "critic": identity(self.critic)}
+        """Everything but the number of scenes, which may grow; checkpoints by name and content, not by place; of the
+        settings, those that differ from the paper's."""
+        record = {
+            "task": self.task, "rig": self.rig, "policy": identity(self.policy), "critic": identity(self.critic),
+            "first_scene": self.first_scene, "max_attempts": self.max_attempts,
+            "arms": [
+                {"name": a.name, "method": a.method, "retry": differences(a.retry, RetryConfig())} for a in self.arms
+            ],
+        }  # fmt: skip
+        return json.loads(json.dumps(record))
+
+
+def differences(settings: Any, usual: Any) -> dict[str, Any]:
+    """The fields in which one dataclass differs from another of its kind, nested as they are."""
+    found = {}
+    for field_ in dataclasses.fields(settings):
+        here, there = getattr(settings, field_.name), getattr(usual, field_.name)
+        if dataclasses.is_dataclass(here):
+            if inner := differences(here, there):
+                found[field_.name] = inner
+        elif repr(here) != repr(there):  # NaN is NaN here
+            found[field_.name] = here
+    return found
 
 
 def identity(path: str) -> str:

@@ -7,7 +7,7 @@ import pytest
 
 from far_app.config import FCPAConfig, RetryConfig
 from far_app.errors import ConfigError
-from far_app.evaluation import Arm, EvaluationPlan, evaluate, read_arms, read_results, run_scene
+from far_app.evaluation import Arm, EvaluationPlan, differences, evaluate, read_arms, read_results, run_scene
 from far_app.types import Attempt, Judge, Outcome, Trial
 
 PLAN = EvaluationPlan(
@@ -112,3 +112,9 @@ def test_results_go_on_wherever_the_checkpoints_lie_but_not_with_others(tmp_path
     )
     assert here.fingerprint() == there.fingerprint() != other.fingerprint()
     assert str(tmp_path) not in json.dumps(here.fingerprint())
+
+
+def test_a_setting_added_later_does_not_estrange_old_results():
+    """Only what differs from the paper's is written down, NaN not differing from itself."""
+    assert differences(RetryConfig(), RetryConfig()) == {}
+    assert differences(RetryConfig(fcpa=FCPAConfig(lr=2e-6)), RetryConfig()) == {"fcpa": {"lr": 2e-6}}

@@ -71,13 +71,15 @@ def assemble(
         beside = shipped(task.name, "critic") if policy is None else path.with_name("critic.safetensors")
         name = f"shipped: {path.name}" if policy is None else str(path)
         network, critic_network = trained(path, critic or beside, task.name, device, entry.needs_critic)
-        if retry.fcpa.guard == "bc" and critic_network is not None:
+        if (retry.fcpa.guard == "bc" or entry.needs_demonstrations) and critic_network is not None:
             demonstrations = load_demonstrations(critic or beside, network)
     made = make_method(
         method,
         Ingredients(
             network=network, critic=critic_network, config=retry, demonstrations=demonstrations,
-            act=lambda net, version: ActingPolicy(net, version, critic_network, engine),
+            act=lambda network, version, steering=None: ActingPolicy(
+                network, version, critic_network, engine, steering
+            ),
         ),
     )  # fmt: skip
     return Parts(method=made, policy_name=name, max_attempts=entry.attempts)

@@ -24,7 +24,7 @@ class RunOptions:
     summary_json: Path | None = None
     """Write the summary here at the end."""
     method: str = "far"
-    """How to retry: dp, nr, perturb, fcpa, far."""
+    """How to retry: dp, nr, perturb, fcpa, far, bgr, rerank, negative-guidance."""
     task: str = "lift"
     rig: str = "twin"
     """Name below hw/rigs, or the path of a rig's TOML file."""

@@ -19,6 +19,7 @@ from far_app.learning.critic import Critic
 from far_app.learning.diffusion import ddim_sample
 from far_app.learning.engines import Engine, runner
 from far_app.learning.policy import DiffusionPolicy, proprioception
+from far_app.learning.steering import Steering, more_noise
 from far_app.protocols import History, PolicySpec
 from far_app.types import ActionChunk, Observation
 
@@ -30,9 +31,14 @@ class ActingPolicy:
     """far_app.protocols.Policy for one version of the weights. Not for several threads at once."""
 
     def __init__(
-        self, network: DiffusionPolicy, version: str, critic: Critic | None = None, engine: Engine = "auto"
+        self,
+        network: DiffusionPolicy,
+        version: str,
+        critic: Critic | None = None,
+        engine: Engine = "auto",
+        steering: Steering | None = None,
     ) -> None:
-        self.network, self.critic, self.version = network, critic, version
+        self.network, self.critic, self.version, self.steering = network, critic, version, steering
         self.spec: PolicySpec = network.spec()
         self.device = network.normalizer.low.device
         self._denoiser = runner(network.denoiser, network.config.horizon, engine)
@@ -46,18 +52,38 @@ class ActingPolicy:
             condition = self._denoiser.condition(features)
             start = torch.from_numpy(np.ascontiguousarray(noise, np.float32)).to(self.device)
             chunks = ddim_sample(self._denoiser.run, condition, start, self.network.config.ddim_steps).cpu().numpy()
-            values = np.full(len(ticks), np.nan)
+            values, shown = np.full(len(ticks), np.nan), features
             if self.critic is not None:
-                values = self.critic.value(self.critic.see(histories, features)).cpu().numpy()
+                shown = self.critic.see(histories, features)
+                values = self.critic.value(shown).cpu().numpy()
+            considered: list[np.ndarray | None] = [None] * len(ticks)
+            for i in range(len(ticks)):
+                if self.steering is not None and self.steering.applies(features[i]):
+                    chunks[i], considered[i] = self._steered(self.steering, features[i], shown[i], noise[i])
         if not np.isfinite(chunks).all():
             raise PolicyError(
                 f"policy {self.spec.name} ({self.version}) planned a non-finite action at tick {ticks[0]}; check its "
                 "training or go back to another checkpoint"
             )
         return [
-            ActionChunk(tick=tick, actions=chunk, policy_version=self.version, value=float(value))
-            for tick, chunk, value in zip(ticks, chunks, values, strict=True)
+            ActionChunk(
+                tick=tick, actions=chunk, policy_version=self.version, value=float(value), candidates=candidates
+            )
+            for tick, chunk, value, candidates in zip(ticks, chunks, values, considered, strict=True)
         ]
+
+    def _steered(
+        self, steering: Steering, features: Float[Tensor, "F"], shown: Float[Tensor, "G"], noise: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The chunk that acts instead, and all that were considered."""
+        start = torch.from_numpy(more_noise(noise, steering.samples)).to(self.device)
+        condition = self._denoiser.condition(features[None]).expand(len(start), -1)
+        chunks = ddim_sample(
+            self._denoiser.run, condition, start, self.network.config.ddim_steps,
+            push=lambda clean: steering.push(features, clean),
+        )  # fmt: skip
+        chosen = chunks[steering.pick(features, shown, chunks)]
+        return chosen.cpu().numpy(), chunks.cpu().numpy()
 
     def features(self, histories: Sequence[History]) -> Float[Tensor, "B F"]:
         """Features of each history, every shared frame encoded once."""

@@ -6,10 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from far_app.errors import ConfigError
+from far_app.methods.bgr import bgr
 from far_app.methods.far import far
 from far_app.methods.fcpa_only import fcpa_only
 from far_app.methods.naive import naive, single
+from far_app.methods.negative_guidance import negative_guidance
 from far_app.methods.perturb import perturb
+from far_app.methods.rerank import rerank
 from far_app.methods.retry import Act, Ingredients
 from far_app.protocols import Method
 
@@ -23,6 +26,7 @@ class Entry:
     attempts: int | None = None
     """Attempts a trial, where the method fixes them; None leaves it to the task."""
     needs_critic: bool = False
+    needs_demonstrations: bool = False
 
 
 METHODS: dict[str, Entry] = {
@@ -31,6 +35,16 @@ METHODS: dict[str, Entry] = {
     "perturb": Entry(make=perturb, summary="retry with perturbed actions"),
     "fcpa": Entry(make=fcpa_only, summary="retry after learning from the failure", needs_critic=True),
     "far": Entry(make=far, summary="retry after learning from the failure, with perturbed actions", needs_critic=True),
+    "bgr": Entry(
+        make=bgr, summary="retry with samples unlike what failed nearby", needs_critic=True, needs_demonstrations=True
+    ),
+    "rerank": Entry(make=rerank, summary="retry with the best of N samples by Q", needs_critic=True),
+    "negative-guidance": Entry(
+        make=negative_guidance,
+        summary="retry with denoising pushed away from what failed nearby",
+        needs_critic=True,
+        needs_demonstrations=True,
+    ),
 }
 
 

@@ -11,8 +11,8 @@ import copy
 import math
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from far_app.learning.critic import Critic
 from far_app.learning.pairs import Pairs, candidates, merged, select, weighted_trajectory
 from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.preference import Demonstrations, Noising
+from far_app.learning.steering import Steering
 from far_app.learning.trainable import trainable
 from far_app.methods import evidence
 from far_app.methods.evidence import recorded_values, sent_chunks, values
@@ -35,8 +36,13 @@ from far_app.protocols import Policy, Progress
 from far_app.seeding import generator
 from far_app.types import Adaptation, AdaptationStep, Attempt
 
-Act = Callable[[DiffusionPolicy, str], Policy]
-"""The Policy that acts with this network, under this version."""
+
+class Act(Protocol):
+    """Makes the Policy that acts with this network, under this version, steered or not."""
+
+    def __call__(self, network: DiffusionPolicy, version: str, steering: Steering | None = None) -> Policy: ...
+
+
 BASE_VERSION = "base"
 
 
@@ -50,7 +56,7 @@ class Ingredients:
     act: Act
     config: RetryConfig = field(default_factory=RetryConfig)
     demonstrations: Demonstrations | None = None
-    """Only the bc guard needs them."""
+    """The bc guard and the failure memory's radius need them."""
 
 
 class RetryMethod:

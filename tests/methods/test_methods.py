@@ -11,10 +11,10 @@ import torch
 from far_app.config import AttributionConfig, FCPAConfig, PairsConfig, PerturbationConfig, RetryConfig
 from far_app.errors import ConfigError
 from far_app.learning.policy import DiffusionPolicy
+from far_app.learning.runtime import ActingPolicy
 from far_app.methods import METHODS, Ingredients, method
 from far_app.methods.evidence import sent_chunks
-from far_app.protocols import History, Method, PolicySpec
-from far_app.types import ActionChunk
+from far_app.protocols import Method
 from tests.learning.small import small_attempt, small_critic, small_policy
 
 QUICK = RetryConfig(
@@ -22,27 +22,19 @@ QUICK = RetryConfig(
 )
 
 
-class Acting:
-    """The plainest Policy: the network itself."""
-
-    def __init__(self, network: DiffusionPolicy, version: str) -> None:
-        self.network, self.version = network, version
-        self.spec: PolicySpec = network.spec()
-
-    def plan(self, histories: list[History], ticks: list[int], noise: np.ndarray) -> list[ActionChunk]:
-        chunks = self.network.sample(self.network.encode(histories), torch.from_numpy(noise)).numpy()
-        return [ActionChunk(tick=t, actions=a, policy_version=self.version) for t, a in zip(ticks, chunks, strict=True)]
-
-
 def made(name: str, config: RetryConfig = QUICK, network: DiffusionPolicy | None = None):
     network = network or small_policy()
-    return method(name, Ingredients(network=network, critic=small_critic(network), act=Acting, config=config))
+    critic = small_critic(network)
+    return method(name, Ingredients(
+        network=network, critic=critic, config=config,
+        act=lambda network, version, steering=None: ActingPolicy(network, version, critic, "torch", steering),
+    ))  # fmt: skip
 
 
-def plan(m: Method) -> np.ndarray:
+def plan(m: Method, seed: int = 0) -> np.ndarray:
     attempt = small_attempt()
     history = (attempt.steps[0].observation, attempt.steps[1].observation)
-    noise = np.random.default_rng(0).standard_normal((1, 8, 7)).astype(np.float32)
+    noise = np.random.default_rng(seed).standard_normal((1, 8, 7)).astype(np.float32)
     return m.policy.plan([history], [1], noise)[0].actions
 
 
@@ -258,8 +250,8 @@ def test_unknown_names_list_the_choices():
 def test_learning_without_a_critic_is_refused_at_once():
     network = small_policy()
     with pytest.raises(ConfigError, match="needs a critic"):
-        method("far", Ingredients(network=network, critic=None, act=Acting))
-    assert method("nr", Ingredients(network=network, critic=None, act=Acting)).name == "nr"
+        method("far", Ingredients(network=network, critic=None, act=lambda *given: None))
+    assert method("nr", Ingredients(network=network, critic=None, act=lambda *given: None)).name == "nr"
 
 
 def test_the_perturbation_follows_the_configuration():

@@ -1,0 +1,61 @@
+"""bgr, rerank and negative-guidance: same weights, other chunks, and only after a failure."""
+
+import numpy as np
+import pytest
+import torch
+
+from far_app.config import ResamplingConfig, RetryConfig
+from far_app.learning.preference import Demonstrations
+from far_app.methods import Ingredients, method
+from far_app.methods.resampling import radius
+from tests.learning.small import small_attempt, small_policy
+from tests.methods.test_methods import adapt, made, plan
+
+
+def plans(m) -> np.ndarray:
+    """Under several noises: the first sample may happen to be the one that is picked."""
+    return np.stack([plan(m, seed) for seed in range(6)])
+
+
+NAMES = ["bgr", "rerank", "negative-guidance"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_failure_changes_how_the_retry_acts_and_the_next_trial_forgets_it(name):
+    m = made(name)
+    m.begin(5)
+    before = plans(m)
+    adaptation = adapt(m)
+    assert adaptation.status == "adapted" and adaptation.flagged and not adaptation.history
+    assert m.policy.version == adaptation.version == f"base+{name}1"
+    assert not np.array_equal(plans(m), before)
+    adapt(m, small_attempt(index=2))
+    assert m.policy.version == f"base+{name}2"
+    m.begin(6)
+    assert m.policy.version == "base"
+    assert np.array_equal(plans(m), before)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_cancelled_lesson_changes_nothing(name):
+    m = made(name)
+    m.begin(5)
+    assert adapt(m, cancelled=lambda: True).status == "cancelled"
+    assert m.policy.version == "base"
+
+
+def test_the_radius_is_a_percentile_of_the_demonstrations_distances():
+    network = small_policy()
+    features = torch.zeros(4, network.feature_dim)
+    features[:, 0] = torch.tensor([0.0, 1.0, 3.0, 7.0])  # nearest others: 1, 1, 2, 4
+    ingredients = Ingredients(
+        network=network, critic=None, act=None, config=RetryConfig(resampling=ResamplingConfig(radius_percentile=50)),
+        demonstrations=Demonstrations(features=features, chunks=torch.zeros(4, 8, 7)),
+    )  # fmt: skip
+    assert radius(ingredients) == pytest.approx(1.5)
+
+
+def test_without_a_critic_it_says_so():
+    network = small_policy()
+    with pytest.raises(Exception, match="needs a critic"):
+        method("rerank", Ingredients(network=network, critic=None, act=lambda *a: None))
