@@ -43,7 +43,7 @@ def solved_within(record: dict[str, Any], attempts: int) -> bool:
 
 
 def comparison(records: Sequence[dict[str, Any]], arms: Sequence[str], max_attempts: int) -> str:
-    """Success by attempt and paired differences against nr and the first attempt, as Markdown."""
+    """Success by attempt, paired differences against nr and the first attempt, and costs, as Markdown."""
     by_arm = {a: {r["scene"]: r for r in records if r["arm"] == a} for a in arms}
     scenes = sorted(set.intersection(*(set(found) for found in by_arm.values()))) if by_arm else []
     head = "| method | " + " | ".join(f"within {k}" for k in range(1, max_attempts + 1)) + " |"
@@ -72,4 +72,21 @@ def comparison(records: Sequence[dict[str, Any]], arms: Sequence[str], max_attem
         p = mcnemar(only_left, only_right)
         interval = f"{100 * mean:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
         lines.append(f"| {name} | {interval} | {only_left} | {only_right} | {p:.3g} |")
+    lines += ["", "| cost | attempts a scene | ticks a scene | adaptations a scene | seconds an adaptation |"]
+    lines.append("|---|---|---|---|---|")
+    lines += [f"| {a} | {' | '.join(costs([by_arm[a][s] for s in scenes]))} |" for a in arms]
     return "\n".join(lines)
+
+
+def costs(records: Sequence[dict[str, Any]]) -> tuple[str, str, str, str]:
+    """Attempts, ticks and adaptations a scene; seconds an adaptation, on the machine that ran it."""
+    if not records:
+        return "–", "–", "–", "–"
+    seconds = [a["seconds"] for r in records for a in r.get("adaptations", ()) if a["status"] != "none"]
+    ticks = sum(sum(r.get("ticks", ())) for r in records)
+    attempts = sum(r["attempts"] for r in records)
+    each = (attempts / len(records), ticks / len(records), len(seconds) / len(records))
+    return (
+        f"{each[0]:.2f}", f"{each[1]:.0f}", f"{each[2]:.2f}",
+        f"{float(np.median(seconds)):.1f}" if seconds else "–",
+    )  # fmt: skip

@@ -2,7 +2,7 @@
 
 import pytest
 
-from far_app.statistics import comparison, mcnemar, paired_difference, solved_within, wilson
+from far_app.statistics import comparison, costs, mcnemar, paired_difference, solved_within, wilson
 
 
 def test_wilson_of_a_known_case():
@@ -33,3 +33,12 @@ def test_only_scenes_that_every_method_has_are_compared():
     records = [{"arm": a, "scene": s, "success": s % 2 == 0, "attempts": 1} for a in ("nr", "far") for s in range(4)]
     table = comparison(records[:-1], ["nr", "far"], 2)
     assert table.startswith("3 scenes")
+
+
+def test_costs_are_means_over_scenes():
+    records = [
+        {"arm": "far", "attempts": 2, "ticks": [150, 60], "adaptations": [{"status": "adapted", "seconds": 4.0}]},
+        {"arm": "far", "attempts": 1, "ticks": [70], "adaptations": []},
+    ]
+    assert costs(records) == ("1.50", "140", "0.50", "4.0")
+    assert costs([]) == ("–", "–", "–", "–")
