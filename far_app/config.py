@@ -148,9 +148,9 @@ class ResamplingConfig:
 
     samples: int = 16
     """N, chunks drawn where a choice is made (paper, Baselines: 16 for DP-BGR)."""
-    radius_percentile: float = 90.0
+    radius_percentile: float = 10.0
     """How near a state must be to a failed one: this percentile of the distances between the demonstrations' states
-    and their nearest others, in feature space (the paper's threshold is not told)."""
+    and their nearest others, in feature space (the paper tells no threshold; a low percentile is our choice)."""
     repulsion: float = 0.3
     """w of negative-guidance: how far each denoising step is pushed from the failed chunk, action units over the whole
     chunk."""

@@ -5,6 +5,7 @@ Used by the methods that retry without an update (far_app/methods/{bgr,rerank,ne
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from far_app.learning.critic import Critic
-from far_app.types import ARM_DIMS
+from far_app.types import ACTION_DIM, ARM_DIMS
 
 
 class Steering(Protocol):
@@ -50,48 +51,67 @@ class Memory:
 
     features: Float[Tensor, "S F"]
     chunks: Float[Tensor, "S H A"]
-    radius: float
-    """L2 distance in feature space within which a state counts as one of them."""
+
+    @classmethod
+    def empty(cls, feature_dim: int, horizon: int) -> Memory:
+        return cls(features=torch.zeros(0, feature_dim), chunks=torch.zeros(0, horizon, ACTION_DIM))
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+    def grown(self, features: Float[Tensor, "S F"], chunks: Float[Tensor, "S H A"]) -> Memory:
+        """With these too."""
+        device = features.device
+        return Memory(
+            features=torch.cat([self.features.to(device), features]), chunks=torch.cat([self.chunks.to(device), chunks])
+        )
 
     def nearest(self, features: Float[Tensor, "F"]) -> tuple[int, float]:
-        """The closest failed state and its distance; (−1, inf) when nothing is remembered."""
-        if not len(self.features):
-            return -1, float("inf")
+        """The closest failed state and its L2 distance in feature space; (−1, inf) when nothing is remembered."""
+        if not len(self):
+            return -1, math.inf
         distances = (self.features - features).norm(dim=1)
         index = int(distances.argmin())
         return index, float(distances[index])
 
-    def applies(self, features: Float[Tensor, "F"]) -> bool:
-        return self.nearest(features)[1] < self.radius
-
 
 @dataclass(frozen=True, kw_only=True)
-class Farthest(Memory):
+class Farthest:
     """Near a failed state, of N chunks the one farthest from what failed there (paper, Baselines: DP-BGR)."""
 
+    memory: Memory
+    radius: float
     samples: int
+
+    def applies(self, features: Float[Tensor, "F"]) -> bool:
+        return self.memory.nearest(features)[1] < self.radius
 
     def push(self, features: Float[Tensor, "F"], clean: Float[Tensor, "N H A"]) -> Float[Tensor, "N H A"]:
         return clean
 
     def pick(self, features: Float[Tensor, "F"], shown: Float[Tensor, "G"], chunks: Float[Tensor, "N H A"]) -> int:
-        failed = self.chunks[self.nearest(features)[0]]
+        failed = self.memory.chunks[self.memory.nearest(features)[0]]
         return int((chunks - failed)[..., :ARM_DIMS].flatten(1).norm(dim=1).argmax())
 
 
 @dataclass(frozen=True, kw_only=True)
-class Repelled(Memory):
+class Repelled:
     """Near a failed state, denoising is pushed away from what failed there:
 
         â_0 ← â_0 + w (â_0 − a⁻) / ‖â_0 − a⁻‖       over the arm's entries, at every denoising step
     """  # fmt: skip
 
+    memory: Memory
+    radius: float
     strength: float
     """w, action units over the whole chunk."""
     samples: int = 1
 
+    def applies(self, features: Float[Tensor, "F"]) -> bool:
+        return self.memory.nearest(features)[1] < self.radius
+
     def push(self, features: Float[Tensor, "F"], clean: Float[Tensor, "N H A"]) -> Float[Tensor, "N H A"]:
-        away = clean - self.chunks[self.nearest(features)[0]]
+        away = clean - self.memory.chunks[self.memory.nearest(features)[0]]
         away[..., ARM_DIMS:] = 0
         length = away.flatten(1).norm(dim=1).clamp(min=1e-6)[:, None, None]
         return clean + self.strength * away / length

@@ -6,15 +6,14 @@ The failure memory lies in the policy encoder's feature space (paper, Baselines;
 from __future__ import annotations
 
 from far_app.learning.steering import Farthest
-from far_app.methods.resampling import Named, Remedy
+from far_app.methods.resampling import Remedy, ResamplingMethod, radius
 from far_app.methods.retry import Ingredients
 
 
+def bgr(ingredients: Ingredients) -> ResamplingMethod:
+    return ResamplingMethod("bgr", ingredients, remedy)
+
+
 def remedy(ingredients: Ingredients) -> Remedy:
-    samples = ingredients.config.resampling.samples
-    return lambda memory, critic: Farthest(
-        features=memory.features, chunks=memory.chunks, radius=memory.radius, samples=samples
-    )
-
-
-bgr = Named("bgr", remedy)
+    near, samples = radius("bgr", ingredients), ingredients.config.resampling.samples
+    return lambda memory, critic: Farthest(memory=memory, radius=near, samples=samples)

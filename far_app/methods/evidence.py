@@ -1,19 +1,23 @@
-"""A failed attempt as arrays: the histories the policy saw, V of every state, the chunks that were sent."""
+"""A failed attempt as arrays: the histories the policy saw, V of every state, the chunks that were sent, the blame."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from far_app.config import AttributionConfig
+from far_app.learning.attribution import flag, value_change
 from far_app.learning.cancellation import Cancelled, check
 from far_app.learning.critic import Critic
 from far_app.learning.policy import DiffusionPolicy
 from far_app.protocols import History
-from far_app.types import Attempt
+from far_app.types import Adaptation, Attempt
 
 HISTORIES_A_PASS = 4
 """Histories encoded between two looks at `cancelled`: a few ms for a light encoder, some 100 ms for ResNets."""
@@ -60,6 +64,26 @@ def values(policy: DiffusionPolicy, critic: Critic, attempt: Attempt, cancelled:
         shown = features(critic.eyes or policy, attempt, missing.tolist(), cancelled)
         found[missing] = critic.value(shown).cpu().numpy()
     return found
+
+
+def unlearnt(attempt: Attempt, version: str, horizon: int) -> Adaptation:
+    """What is known of a failure before anything was learnt from it."""
+    found = recorded_values(attempt)
+    return Adaptation(
+        status="none", base_version=version, version=version, values=found,
+        value_changes=value_change(found, horizon), threshold=math.nan, flagged=(),
+    )  # fmt: skip
+
+
+def attributed(
+    adaptation: Adaptation, attempt: Attempt, policy: DiffusionPolicy, critic: Critic, config: AttributionConfig,
+    cancelled: Cancelled,
+) -> Adaptation:  # fmt: skip
+    """The adaptation with every V, every ΔV, and the chunks to blame."""
+    found = values(policy, critic, attempt, cancelled)
+    changes = value_change(found, policy.config.horizon)
+    flags = flag(changes, config)
+    return replace(adaptation, values=found, value_changes=changes, threshold=flags.threshold, flagged=flags.ticks)
 
 
 def sent_chunks(attempt: Attempt, ticks: Sequence[int], horizon: int) -> Float[np.ndarray, "S H A"]:

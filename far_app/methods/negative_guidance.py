@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from far_app.learning.steering import Repelled
-from far_app.methods.resampling import Named, Remedy
+from far_app.methods.resampling import Remedy, ResamplingMethod, radius
 from far_app.methods.retry import Ingredients
 
 
+def negative_guidance(ingredients: Ingredients) -> ResamplingMethod:
+    return ResamplingMethod("negative-guidance", ingredients, remedy)
+
+
 def remedy(ingredients: Ingredients) -> Remedy:
-    strength = ingredients.config.resampling.repulsion
-    return lambda memory, critic: Repelled(
-        features=memory.features, chunks=memory.chunks, radius=memory.radius, strength=strength
-    )
-
-
-negative_guidance = Named("negative-guidance", remedy)
+    near, strength = radius("negative-guidance", ingredients), ingredients.config.resampling.repulsion
+    return lambda memory, critic: Repelled(memory=memory, radius=near, strength=strength)

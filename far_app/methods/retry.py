@@ -8,7 +8,6 @@ return at a trial's end is exact.
 from __future__ import annotations
 
 import copy
-import math
 import threading
 import time
 from dataclasses import dataclass, field, replace
@@ -21,7 +20,6 @@ from torch import Tensor, nn
 from far_app.config import RetryConfig
 from far_app.errors import ConfigError, FarError
 from far_app.learning import diffusion, fcpa
-from far_app.learning.attribution import flag, value_change
 from far_app.learning.cancellation import AdaptationCancelledError, Cancelled, check
 from far_app.learning.critic import Critic
 from far_app.learning.pairs import Pairs, candidates, merged, select, weighted_trajectory
@@ -30,7 +28,7 @@ from far_app.learning.preference import Demonstrations, Noising
 from far_app.learning.steering import Steering
 from far_app.learning.trainable import trainable
 from far_app.methods import evidence
-from far_app.methods.evidence import recorded_values, sent_chunks, values
+from far_app.methods.evidence import sent_chunks
 from far_app.perturbation import Perturbation, perturbation
 from far_app.protocols import Policy, Progress
 from far_app.seeding import generator
@@ -91,12 +89,7 @@ class RetryMethod:
     def adapt(self, attempt: Attempt, cancelled: Cancelled, progress: Progress) -> Adaptation:
         trial, version = self._trial, self.policy.version
         outdated: Cancelled = lambda: cancelled() or self._trial != trial  # noqa: E731
-        horizon = self.policy.spec.horizon
-        found = recorded_values(attempt)
-        nothing = Adaptation(
-            status="none", base_version=version, version=version, values=found,
-            value_changes=value_change(found, horizon), threshold=math.nan, flagged=(),
-        )  # fmt: skip
+        nothing = evidence.unlearnt(attempt, version, self.policy.spec.horizon)
         if not self.adapts:
             return nothing
         learning = _Learning(self, attempt, outdated, nothing)
@@ -161,12 +154,13 @@ class _Learning:
         method, config = self.method, self.method.config
         critic = method.critic
         assert critic is not None, "checked when the method was made"
-        found = values(method.base, critic, self.attempt, self.cancelled)
-        changes = value_change(found, method.policy.spec.horizon)
-        flags = flag(changes, config.attribution)
-        self.note("attribution", values=found, value_changes=changes, threshold=flags.threshold, flagged=flags.ticks)
+        self.adaptation = evidence.attributed(
+            self.adaptation, self.attempt, method.base, critic, config.attribution, self.cancelled
+        )
+        self.note("attribution")
         progress(self.adaptation)
-        pairs = self._trajectory(critic) if config.fcpa.objective == "awr" else self._pairs(critic, flags.ticks)
+        awr = config.fcpa.objective == "awr"
+        pairs = self._trajectory(critic) if awr else self._pairs(critic, self.adaptation.flagged)
         self.note("pairs", pairs=len(pairs), empty_states=pairs.empty_states)
         progress(self.adaptation)
         if not len(pairs):

@@ -40,7 +40,8 @@ def loop_priority() -> Iterator[str]:
     try:
         yield "fifo"
     finally:
-        os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+        # the flag stays: without privilege a thread may lower its priority but not take that flag back
+        os.sched_setscheduler(thread, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
 
 
 def prepare_process(torch_threads: int) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
 
 from far_app.learning.runtime import ActingPolicy
@@ -13,32 +14,40 @@ FAILED = torch.zeros(1, 2, 7)
 STATE = torch.ones(3)
 
 
-def memory(kind, **settings):
-    return kind(features=torch.ones(1, 3), chunks=FAILED, radius=0.5, **settings)
+ONE = Memory(features=torch.ones(1, 3), chunks=FAILED)
+
+
+def near(kind, **settings):
+    return kind(memory=ONE, radius=0.5, **settings)
 
 
 def test_a_state_counts_when_it_is_near_a_failed_one():
-    kept = memory(Memory)
-    assert kept.applies(STATE + 0.1)
-    assert not kept.applies(STATE + 1.0)
-    nothing = dataclasses.replace(kept, features=torch.zeros(0, 3), chunks=torch.zeros(0, 2, 7))
-    assert not nothing.applies(STATE)
+    steering = near(Farthest, samples=3)
+    assert steering.applies(STATE + 0.1)
+    assert not steering.applies(STATE + 1.0)
+    assert not dataclasses.replace(steering, memory=Memory.empty(3, 2)).applies(STATE)
+
+
+def test_a_memory_grows_and_finds_the_nearest():
+    grown = ONE.grown(torch.full((1, 3), 4.0), FAILED + 1)
+    assert len(grown) == 2 and len(ONE) == 1
+    assert grown.nearest(torch.full((3,), 3.5)) == (1, pytest.approx(0.75**0.5))
 
 
 def test_the_farthest_sample_by_the_arms_entries_acts():
     chunks = torch.zeros(3, 2, 7)
     chunks[1, :, 0] = 0.5
     chunks[2, :, 6] = 1.0  # the gripper alone is no difference
-    assert memory(Farthest, samples=3).pick(STATE, STATE, chunks) == 1
+    assert near(Farthest, samples=3).pick(STATE, STATE, chunks) == 1
 
 
 def test_repulsion_moves_away_by_its_strength_and_leaves_the_gripper():
     clean = torch.zeros(1, 2, 7)
     clean[0, 0, 1], clean[0, 1, 6] = 0.2, 0.7
-    pushed = memory(Repelled, strength=0.3).push(STATE, clean)
+    pushed = near(Repelled, strength=0.3).push(STATE, clean)
     assert torch.allclose(pushed[0, 0, 1], torch.tensor(0.5))
     assert torch.equal(pushed[..., 6], clean[..., 6])
-    assert torch.isfinite(memory(Repelled, strength=0.3).push(STATE, FAILED.clone())).all(), "even at the chunk itself"
+    assert torch.isfinite(near(Repelled, strength=0.3).push(STATE, FAILED.clone())).all(), "even at the chunk itself"
 
 
 def test_the_best_of_n_by_q_acts():

@@ -11,9 +11,10 @@ import torch
 from far_app.config import AttributionConfig, FCPAConfig, PairsConfig, PerturbationConfig, RetryConfig
 from far_app.errors import ConfigError
 from far_app.learning.policy import DiffusionPolicy
+from far_app.learning.preference import Demonstrations
 from far_app.learning.runtime import ActingPolicy
 from far_app.methods import METHODS, Ingredients, method
-from far_app.methods.evidence import sent_chunks
+from far_app.methods.evidence import history, sent_chunks
 from far_app.protocols import Method
 from tests.learning.small import small_attempt, small_critic, small_policy
 
@@ -26,16 +27,19 @@ def made(name: str, config: RetryConfig = QUICK, network: DiffusionPolicy | None
     network = network or small_policy()
     critic = small_critic(network)
     return method(name, Ingredients(
-        network=network, critic=critic, config=config,
+        network=network, critic=critic, config=config, demonstrations=demonstrations(network),
         act=lambda network, version, steering=None: ActingPolicy(network, version, critic, "torch", steering),
     ))  # fmt: skip
 
 
-def plan(m: Method, seed: int = 0) -> np.ndarray:
-    attempt = small_attempt()
-    history = (attempt.steps[0].observation, attempt.steps[1].observation)
+def demonstrations(network: DiffusionPolicy) -> Demonstrations:
+    features = network.encode([history(small_attempt(), t, 2) for t in range(0, 40, 4)])
+    return Demonstrations(features=features, chunks=torch.zeros(len(features), 8, 7))
+
+
+def plan(m: Method, seed: int = 0, tick: int = 1) -> np.ndarray:
     noise = np.random.default_rng(seed).standard_normal((1, 8, 7)).astype(np.float32)
-    return m.policy.plan([history], [1], noise)[0].actions
+    return m.policy.plan([history(small_attempt(), tick, 2)], [tick], noise)[0].actions
 
 
 def adapt(m: Method, attempt=None, cancelled=lambda: False):

@@ -5,16 +5,17 @@ import pytest
 import torch
 
 from far_app.config import ResamplingConfig, RetryConfig
+from far_app.errors import ConfigError
 from far_app.learning.preference import Demonstrations
 from far_app.methods import Ingredients, method
 from far_app.methods.resampling import radius
-from tests.learning.small import small_attempt, small_policy
+from tests.learning.small import small_attempt, small_critic, small_policy
 from tests.methods.test_methods import adapt, made, plan
 
 
-def plans(m) -> np.ndarray:
+def plans(m, tick: int) -> np.ndarray:
     """Under several noises: the first sample may happen to be the one that is picked."""
-    return np.stack([plan(m, seed) for seed in range(6)])
+    return np.stack([plan(m, seed, tick) for seed in range(6)])
 
 
 NAMES = ["bgr", "rerank", "negative-guidance"]
@@ -22,18 +23,19 @@ NAMES = ["bgr", "rerank", "negative-guidance"]
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_failure_changes_how_the_retry_acts_and_the_next_trial_forgets_it(name):
+    to_blame = adapt(made(name)).flagged[0]
     m = made(name)
     m.begin(5)
-    before = plans(m)
+    before = plans(m, to_blame)
     adaptation = adapt(m)
     assert adaptation.status == "adapted" and adaptation.flagged and not adaptation.history
     assert m.policy.version == adaptation.version == f"base+{name}1"
-    assert not np.array_equal(plans(m), before)
+    assert not np.array_equal(plans(m, to_blame), before)
     adapt(m, small_attempt(index=2))
     assert m.policy.version == f"base+{name}2"
     m.begin(6)
     assert m.policy.version == "base"
-    assert np.array_equal(plans(m), before)
+    assert np.array_equal(plans(m, to_blame), before)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -52,10 +54,18 @@ def test_the_radius_is_a_percentile_of_the_demonstrations_distances():
         network=network, critic=None, act=None, config=RetryConfig(resampling=ResamplingConfig(radius_percentile=50)),
         demonstrations=Demonstrations(features=features, chunks=torch.zeros(4, 8, 7)),
     )  # fmt: skip
-    assert radius(ingredients) == pytest.approx(1.5)
+    assert radius("bgr", ingredients) == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize("name", ["bgr", "negative-guidance"])
+def test_without_demonstrations_there_is_no_measure_of_nearness(name):
+    network = small_policy()
+    ingredients = Ingredients(network=network, critic=small_critic(network), act=lambda *given: None)
+    with pytest.raises(ConfigError, match=f"{name}.*demonstrations beside the critic"):
+        method(name, ingredients)
 
 
 def test_without_a_critic_it_says_so():
     network = small_policy()
-    with pytest.raises(Exception, match="needs a critic"):
+    with pytest.raises(ConfigError, match="needs a critic"):
         method("rerank", Ingredients(network=network, critic=None, act=lambda *a: None))
