@@ -18,6 +18,7 @@ import zmq
 from far_app.endpoints import Endpoints, Reply
 from far_app.errors import RobotError
 from far_app.protocols import Heartbeat, Hold, Request, Reset
+from far_app.scheduling import prompt_context
 from far_app.types import Ack, Observation, Target
 from far_app.wire import WireError, pack, unpack
 
@@ -38,7 +39,7 @@ class RemoteRobot:
 
     def __init__(self, endpoints: Endpoints, connect_timeout: float = 30.0) -> None:
         """Waits for the first observation; raises RobotError when none comes within connect_timeout seconds."""
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._context = prompt_context()
         self.endpoints = endpoints
         self._targets = self._dealer(send_limit=16)
         self._requests = self._dealer(send_limit=16)

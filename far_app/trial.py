@@ -41,7 +41,7 @@ from far_app.types import (
 @dataclass(frozen=True, kw_only=True)
 class Tick:
     """Let one tick pass; answered with the tick's absolute deadline, seconds on the robot's clock: the machine's
-    monotonic clock in real time, simulated time in lockstep. The tick's target is created, and due, at its deadline."""
+    monotonic clock in real time, simulated time in lockstep. By then the tick's target is to be with the arm."""
 
     phase: str
     """"attempt" or "homing"."""

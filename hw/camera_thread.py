@@ -18,11 +18,11 @@ import zmq
 
 from far_app.config import TaskConfig
 from far_app.errors import FarError, GraphicsError
+from far_app.scheduling import DRAWING_NICENESS, PROMPT_NICENESS, nice
 from far_app.telemetry import SceneGeometry, View
 from far_app.wire import pack
 from hw.cameras import Moment, TwinCamera
 from hw.plant import PlantView
-from hw.priority import DRAWING_NICENESS, PROMPT_NICENESS, nice
 from hw.rig import RigConfig
 from hw.servo_thread import ServoThread
 

@@ -14,6 +14,7 @@ import zmq
 from far_app.endpoints import Endpoints, Reply
 from far_app.errors import RobotError
 from far_app.protocols import Heartbeat, Hold, Home, Reset, Resume
+from far_app.scheduling import MESSAGE_PRIORITY, real_time
 from far_app.telemetry import GeometryRequest, SceneGeometry
 from far_app.types import Target
 from far_app.wire import WireError, pack, unpack
@@ -56,6 +57,7 @@ class CommandThread:
         self._thread.join(timeout=2.0)
 
     def _run(self) -> None:
+        real_time(MESSAGE_PRIORITY)
         self._commands = self._context.socket(zmq.ROUTER)
         geometry = self._context.socket(zmq.REP)
         for socket, endpoint in ((self._commands, self._endpoints.commands), (geometry, self._endpoints.geometry)):

@@ -11,8 +11,8 @@ import numpy as np
 
 WINDOW = 15
 """Ticks looked at before a shift: half a second."""
-LEAST = 0.003
-"""Seconds of lead kept for a picture that takes longer than most."""
+LEAST = 0.004
+"""Seconds of lead kept for a picture that takes longer than most, and because a tick begins before its deadline."""
 SLACK = 0.001
 """Seconds beyond a servo period before a later snapshot is worth it."""
 MISSES = 0.1

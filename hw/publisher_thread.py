@@ -13,6 +13,7 @@ from collections import deque
 
 import zmq
 
+from far_app.scheduling import MESSAGE_PRIORITY, real_time
 from far_app.wire import pack
 from hw.camera_thread import Pictures
 from hw.observing import observation
@@ -58,6 +59,7 @@ class PublisherThread:
         self._thread.join(timeout=2.0)
 
     def _run(self) -> None:
+        real_time(MESSAGE_PRIORITY)
         socket = self._context.socket(zmq.PUB)
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.SNDHWM, 64)

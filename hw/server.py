@@ -33,13 +33,13 @@ from far_app.config import TaskConfig
 from far_app.endpoints import Endpoints
 from far_app.errors import ConfigError, FarError, RobotError
 from far_app.protocols import Hold
+from far_app.scheduling import PROMPT_NICENESS, SWITCH_INTERVAL, nice, prompt_context
 from far_app.tasks import task as task_named
 from hw.camera_thread import CameraThread
 from hw.command_thread import CommandThread
 from hw.controller import ArmController
 from hw.picture_timing import PictureTiming
 from hw.plant import Plant, PlantView
-from hw.priority import PROMPT_NICENESS, nice
 from hw.publisher_thread import PublisherThread
 from hw.rig import RigConfig, load_rig
 from hw.servo_thread import ServoThread
@@ -71,7 +71,7 @@ class Server:
     """All threads of the hw server around one plant."""
 
     def __init__(self, rig: RigConfig, task: TaskConfig, endpoints: Endpoints) -> None:
-        self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self.context = prompt_context()
         self.plant, make_view = make_plant(rig, task)
         controller = ArmController(rig, task, self.plant.servo_hz, self.plant.measure())
         self.servo = ServoThread(self.plant, controller, camera_rate=task.rate)
@@ -110,21 +110,26 @@ class Server:
         log.info("cameras: %d moments, %.1f ms each", self.cameras.drawn, self.cameras.milliseconds)
 
 
-def wait_for_the_end(parent: int | None) -> str:
-    """Sleeps until a signal or the parent's death; returns why to end."""
-    ended = threading.Event()
-    reasons: list[str] = []
+class Ending:
+    """Why to end: a signal, or the parent's death. Listens from its construction."""
 
-    def on_signal(number: int, frame: object) -> None:
-        reasons.append(f"the hw server was told to end ({signal.Signals(number).name})")
-        ended.set()
+    def __init__(self, parent: int | None) -> None:
+        self._parent = parent
+        self._told = threading.Event()
+        self._reasons: list[str] = []
+        signal.signal(signal.SIGTERM, self._on_signal)
+        signal.signal(signal.SIGINT, self._on_signal)
 
-    signal.signal(signal.SIGTERM, on_signal)
-    signal.signal(signal.SIGINT, on_signal)
-    while not ended.wait(LOOK):
-        if parent is not None and os.getppid() != parent:
-            return "the app is gone"
-    return reasons[0]
+    def wait(self) -> str:
+        """Sleeps until then; returns why."""
+        while not self._told.wait(LOOK):
+            if self._parent is not None and os.getppid() != self._parent:
+                return "the app is gone"
+        return self._reasons[0]
+
+    def _on_signal(self, number: int, frame: object) -> None:
+        self._reasons.append(f"the hw server was told to end ({signal.Signals(number).name})")
+        self._told.set()
 
 
 def serve(
@@ -143,11 +148,12 @@ def serve(
         server.start()
     except zmq.ZMQError as error:
         raise RobotError(f"cannot serve below {folder}: {error}; choose another folder") from error
+    ending = Ending(parent)
     say({
         "ready": True, "pid": os.getpid(), "servo_hz": server.plant.servo_hz, "cameras": list(task.cameras),
         "scheduling": server.servo.scheduling, "seconds": round(time.monotonic() - began, 2),
     })  # fmt: skip
-    why = wait_for_the_end(parent)
+    why = ending.wait()
     log.info("ending: %s", why)
     server.close(why)
 
@@ -162,8 +168,8 @@ def main(arguments: list[str] | None = None) -> int:
     handshake = os.fdopen(os.dup(1), "w")  # standard output stays ours; what libraries print goes to standard error
     os.dup2(2, 1)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr)
-    sys.setswitchinterval(0.0005)
-    nice(PROMPT_NICENESS)  # inherited by ZeroMQ's own threads
+    sys.setswitchinterval(SWITCH_INTERVAL)
+    nice(PROMPT_NICENESS)  # inherited by every thread that does not ask for its own
     cv2.setNumThreads(1)
 
     def say(words: dict[str, object]) -> None:

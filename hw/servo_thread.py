@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from far_app.errors import FarError
+from far_app.scheduling import SERVO_NICENESS, SERVO_PRIORITY, real_time
 from hw.cameras import Moment
 from hw.controller import ArmController
 from hw.plant import Measured, Plant
-from hw.priority import real_time
 
 log = logging.getLogger(__name__)
 
@@ -120,7 +120,7 @@ class ServoThread:
         self._thread.join(timeout=2.0)
 
     def _run(self) -> None:
-        self.scheduling = real_time()
+        self.scheduling = real_time(SERVO_PRIORITY, SERVO_NICENESS)
         log.info("servo thread at %d Hz, scheduling %s", self._plant.servo_hz, self.scheduling)
         try:
             self._loop(1.0 / self._plant.servo_hz)

@@ -9,9 +9,9 @@ import time
 import zmq
 
 from far_app.errors import RobotError
+from far_app.scheduling import STOP_PRIORITY, prompt_context, real_time
 from far_app.telemetry import StopAck, StopRequest
 from far_app.wire import WireError, pack, unpack
-from hw.priority import SERVO_PRIORITY, real_time
 from hw.servo_thread import ServoThread
 
 log = logging.getLogger(__name__)
@@ -22,7 +22,7 @@ class StopThread:
 
     def __init__(self, servo: ServoThread, endpoint: str) -> None:
         self._servo, self._endpoint = servo, endpoint
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
+        self._context = prompt_context()
         self._bound = threading.Event()
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="stop", daemon=True)
@@ -38,7 +38,7 @@ class StopThread:
         self._context.destroy(linger=0)
 
     def _run(self) -> None:
-        real_time(SERVO_PRIORITY + 1)
+        real_time(STOP_PRIORITY)
         socket = self._context.socket(zmq.REP)
         socket.setsockopt(zmq.LINGER, 100)
         socket.bind(self._endpoint)

@@ -1,27 +1,26 @@
 """The floor: how late a bare 30 Hz sleeper wakes on this machine, under the same load and priority as the loop.
 
 `python -m far_app.bench.floor` sleeps until SIGTERM (or its parent's death) and prints [[deadline, late], …] as JSON.
-Imports nothing heavier than the standard library, so that nothing but the machine is measured.
+Runs nothing else, so that nothing but the machine is measured.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import signal
 import sys
-import threading
 import time
+
+from far_app.scheduling import LOOP_PRIORITY, real_time
 
 
 def main() -> None:
-    rate, niceness = float(sys.argv[1]), int(sys.argv[2])
+    rate = float(sys.argv[1])
     ended: list[int] = []
     signal.signal(signal.SIGTERM, lambda *_: ended.append(1))
     parent = os.getppid()
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
+    real_time(LOOP_PRIORITY)
     period = 1.0 / rate
     due = time.monotonic() + period
     woken: list[tuple[float, float]] = []

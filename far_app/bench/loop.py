@@ -29,7 +29,6 @@ from far_app.errors import ConfigError, FarError
 from far_app.protocols import Method
 from far_app.session.adaptation import BackgroundAdaptation, unchanged
 from far_app.session.inbox import IntentInbox
-from far_app.session.realtime import LOOP_NICENESS
 from far_app.session.statistics import LoopStatistics, percentiles
 from far_app.session_states import Intent
 from far_app.types import Attempt
@@ -148,7 +147,7 @@ def learning_all_along(method: Method, attempt: Attempt) -> Iterator[list[float]
 def floor(rate: float) -> Iterator[list[tuple[float, float]]]:
     """The sleeper, alongside; its wake-ups are there at the end."""
     woken: list[tuple[float, float]] = []
-    command = [sys.executable, "-m", "far_app.bench.floor", str(rate), str(LOOP_NICENESS)]
+    command = [sys.executable, "-m", "far_app.bench.floor", str(rate)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         yield woken

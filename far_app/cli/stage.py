@@ -28,10 +28,11 @@ from far_app.link import RemoteRobot
 from far_app.protocols import Method, PlanRequest, Policy
 from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
+from far_app.scheduling import PROMPT_NICENESS, nice
 from far_app.session.inbox import IntentInbox
 from far_app.session.planners import ThreadedPlanner, plan_one
 from far_app.session.publisher import TelemetryPublisher
-from far_app.session.realtime import LOOP_NICENESS, prepare_process, set_niceness
+from far_app.session.realtime import prepare_process
 from far_app.session.recorder import Recorder
 from far_app.session.session import Session, SessionSettings
 from far_app.session.statistics import LoopStatistics
@@ -112,8 +113,8 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         task = dataclasses.replace(task, max_attempts=options.max_attempts or parts.max_attempts or task.max_attempts)
         # From here on this process's threads come before the machine's others: one that is not scheduled while it holds
         # the interpreter would keep the loop waiting. The processes above were started before, at the usual priority.
-        set_niceness(LOOP_NICENESS)
-        stack.callback(set_niceness, 0)
+        nice(PROMPT_NICENESS)
+        stack.callback(nice, 0)
         robot = stack.enter_context(connected(folder, hardware))
         if page is not None:
             wait_for_page(page, options.host, port)
@@ -182,7 +183,7 @@ def revived(family: Family, page: Child | None) -> Iterator[None]:
     ended = threading.Event()
 
     def watch() -> None:
-        set_niceness(0)  # which the page inherits
+        nice(0)  # which the page inherits
         while page is not None and not ended.wait(0.5):
             family.revive(page)
 

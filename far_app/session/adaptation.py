@@ -10,7 +10,7 @@ import time
 import numpy as np
 
 from far_app.protocols import Method
-from far_app.session.realtime import BACKGROUND_NICENESS, set_niceness
+from far_app.scheduling import BACKGROUND_NICENESS, nice
 from far_app.types import Adaptation, AdaptationStep, Attempt
 
 log = logging.getLogger(__name__)
@@ -63,7 +63,7 @@ class BackgroundAdaptation:
         return self._adaptation or unchanged(self._base_version, self._why)
 
     def _work(self, method: Method, attempt: Attempt) -> None:
-        set_niceness(BACKGROUND_NICENESS)
+        nice(BACKGROUND_NICENESS)
         try:
             self._adaptation = method.adapt(attempt, self._cancelled.is_set, self._hear)
         except Exception as error:

@@ -12,7 +12,7 @@ import numpy as np
 from far_app.errors import PolicyError
 from far_app.noise import keyed_noise
 from far_app.protocols import History, PlanRequest, Policy
-from far_app.session.realtime import INFERENCE_NICENESS, set_niceness
+from far_app.scheduling import PROMPT_NICENESS, nice
 from far_app.types import ActionChunk
 
 NoiseKey = tuple[int, int, int]
@@ -132,7 +132,7 @@ class ThreadedPlanner:
         self._epoch += 1
 
     def _work(self) -> None:
-        set_niceness(INFERENCE_NICENESS)
+        nice(PROMPT_NICENESS)
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._request is not None or self._closing)

@@ -17,6 +17,7 @@ from far_app.detectors import OperatorOverride
 from far_app.errors import RobotError
 from far_app.motion import ActionScale
 from far_app.protocols import Hold, Method, PlanRequest, Robot, SuccessDetector
+from far_app.scheduling import LOOP_PRIORITY, real_time_inside
 from far_app.session.adaptation import BackgroundAdaptation, unchanged
 from far_app.session.board import Board
 from far_app.session.clock import TickClock
@@ -24,7 +25,7 @@ from far_app.session.inbox import IntentInbox
 from far_app.session.lockstep import FinishedAdaptation
 from far_app.session.planners import ThreadedPlanner
 from far_app.session.publisher import TelemetryPublisher
-from far_app.session.realtime import collect_between, collector_off, loop_priority
+from far_app.session.realtime import collect_between, collector_off
 from far_app.session.recorder import Recorder
 from far_app.session.statistics import LoopStatistics
 from far_app.session.supervision import Freshness, Supervision, TrialAbandoned
@@ -106,7 +107,7 @@ class Session:
         """All trials, or until the operator quits. Raises SessionFault (headless), RecordingError and RobotError."""
         supervision, number = self.supervision, 0
         try:
-            with loop_priority() as scheduling, collector_off():
+            with real_time_inside(LOOP_PRIORITY) as scheduling, collector_off():
                 log.info("the loop is scheduled %s", scheduling)
                 self.robot.refresh()
                 while self._between_trials():

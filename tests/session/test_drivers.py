@@ -44,6 +44,16 @@ def test_deadlines_lie_on_one_grid_whatever_a_tick_costs(monkeypatch):
     assert clock.stalls == 0
 
 
+def test_work_begins_just_before_the_deadline_so_that_the_target_is_there_in_time(monkeypatch):
+    fake = FakeTime(monkeypatch)
+    clock = TickClock(rate=10.0, lead=0.001)
+    clock.restart()
+    for cost in (0.02, 0.0995, 0.05):
+        due = clock.wait()
+        assert fake.now == pytest.approx(due - 0.001, abs=1e-9)
+        fake.now += cost
+
+
 def test_a_stall_is_counted_and_never_followed_by_a_burst(monkeypatch):
     fake = FakeTime(monkeypatch)
     clock = TickClock(rate=10.0)

@@ -1,0 +1,94 @@
+"""Who runs before whom, in every process of a run. Asked for, and done without where the system does not permit it.
+
+Real time (SCHED_FIFO) is for what runs a moment and must not wait its turn; the higher number goes first:
+
+    STOP 21 · servo 20 · messages between app and arm 15 · the app's loop 10
+
+The rest share the cores by niceness; a thread that runs Python beside one of the above holds its interpreter, and must
+itself not wait long for a core.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import threading
+from collections.abc import Iterator
+
+import zmq
+
+STOP_PRIORITY = 21
+SERVO_PRIORITY = 20
+MESSAGE_PRIORITY = 15
+LOOP_PRIORITY = 10
+
+SERVO_NICENESS = -15
+PROMPT_NICENESS = -10
+"""Of threads beside a real-time one, and of those where real time is not permitted."""
+DRAWING_NICENESS = -5
+"""Of the GL driver's worker threads: before anything on the machine that did not ask, after the loop."""
+BACKGROUND_NICENESS = 0
+"""Of learning: after all that drives the arm, but no lower, for between its operations it holds the interpreter."""
+
+SWITCH_INTERVAL = 1e-4
+"""Seconds a thread that wants the interpreter waits before it asks the holder for it (sys.setswitchinterval)."""
+
+_PR_SET_TIMERSLACK = 29
+_TIMER_SLACK_NS = 1000
+
+
+def nice(niceness: int) -> bool:
+    """The calling thread's own niceness (Linux threads have one each); False where not permitted."""
+    try:
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
+    except (OSError, AttributeError):
+        return False
+    return True
+
+
+def real_time(priority: int, niceness: int = PROMPT_NICENESS) -> str:
+    """The best the calling thread can get: "fifo", "nice" or "normal"; and timers exact to a microsecond. Threads and
+    processes that it starts begin at the usual priority."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_TIMERSLACK, _TIMER_SLACK_NS, 0, 0, 0)
+    if _schedule(priority, os.SCHED_RESET_ON_FORK):
+        return "fifo"
+    return "nice" if nice(niceness) else "normal"
+
+
+@contextlib.contextmanager
+def real_time_inside(priority: int, niceness: int = PROMPT_NICENESS) -> Iterator[str]:
+    """The same for a while; what it began with is given back (its niceness only if real time was permitted)."""
+    scheduling = real_time(priority, niceness)
+    try:
+        yield scheduling
+    finally:
+        if scheduling == "fifo":
+            # the flag stays: without privilege a thread may lower its priority but not take that flag back
+            os.sched_setscheduler(threading.get_native_id(), os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+
+
+def prompt_context() -> zmq.Context[zmq.Socket[bytes]]:
+    """A ZeroMQ context whose own thread carries messages at MESSAGE_PRIORITY, so that one between app and arm does not
+    wait behind inference for a core."""
+    made: list[zmq.Context[zmq.Socket[bytes]]] = []
+
+    def make() -> None:
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
+        _schedule(MESSAGE_PRIORITY)
+        context.socket(zmq.PAIR).close()  # the first socket starts the context's thread, which inherits the priority
+        made.append(context)
+
+    thread = threading.Thread(target=make, name="prompt-context")
+    thread.start()
+    thread.join()
+    return made[0]
+
+
+def _schedule(priority: int, flags: int = 0) -> bool:
+    try:
+        os.sched_setscheduler(threading.get_native_id(), os.SCHED_FIFO | flags, os.sched_param(priority))
+    except (OSError, AttributeError):
+        return False
+    return True
