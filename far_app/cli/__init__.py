@@ -20,6 +20,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "bench loop": ("far_app.bench.loop", "lateness of the 30 Hz loop, idle and adapting"),
     "bench infer": ("far_app.bench.infer", "milliseconds per chunk, by preset"),
     "bench adapt": ("far_app.bench.adapt", "seconds from a failed attempt to a new policy version, by stage"),
+    "bench critic": ("far_app.bench.critic", "can Q rank what the policy would do: before trusting FAR with a model"),
     "doctor": ("far_app.cli.doctor", "what this machine has, and what to do about what it lacks"),
 }
 

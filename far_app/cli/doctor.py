@@ -138,7 +138,7 @@ def engine() -> Finding:
         )
     return Finding(
         good=True, text="a run on this CPU takes torch; OpenVINO is not installed",
-        advice="pip install openvino makes inference about twice as fast",
+        advice="pip install openvino makes inference faster (10 ms a chunk in place of 17 on two cores)",
     )  # fmt: skip
 
 
