@@ -145,7 +145,7 @@ class Ranking:
         best = np.argsort(-scores)[:BEST]
         return cls(
             spread=float(np.sqrt(((ahead - ahead.mean(0)) ** 2).sum(1).mean())),
-            correlation=float(np.corrcoef(*ranks)[0, 1]),
+            correlation=float(np.corrcoef(ranks)[0, 1]),
             gain=float(progress[best].mean() - progress.mean()),
         )
 
