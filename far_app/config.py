@@ -11,6 +11,8 @@ from far_app.errors import ConfigError
 
 T = TypeVar("T")
 
+Arm = Literal["xarm7", "panda"]
+
 
 def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     """Settings from a TOML table, nested as the dataclasses are; what is not given keeps its default. Raises
@@ -183,14 +185,18 @@ class TaskConfig:
     """robosuite's name."""
     horizon: int
     """Policy ticks an attempt may take."""
+    repeat: int = 1
+    """Control steps for which a policy's action is repeated within its tick (paper, Simulation: 3 for some tasks)."""
+    objects: tuple[tuple[str, str], ...] = ()
+    """What the twin tells of the scene: a name for people and policies, and MuJoCo's body or site."""
     success_ticks: int = 5
     """Consecutive ticks for which the twin's own check must hold."""
     max_attempts: int = 5
     """N (paper: 5 in simulation, 3 on the real arm)."""
     rate: float = 30.0
     """Policy ticks a second."""
-    placement: tuple[float, float] = (0.12, 0.12)
-    """Half-width of the objects' start region in x and y, metres."""
+    placement: tuple[float, float] | None = None
+    """Half-width of the objects' start region in x and y, metres; robosuite's own where it is None."""
     release: Literal["open", "lower_then_open", "ask"] = "open"
     """How to let go before homing."""
     retreat: tuple[float, float, float] = (0.0, 0.0, 0.10)

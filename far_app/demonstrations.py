@@ -27,7 +27,7 @@ def demonstrate(
         robot.request(Heartbeat())
         now = advance()
     observation = robot.observe()
-    act = expert(task.name, np.random.default_rng(seed), scale, observation.eef)
+    act = expert(task, np.random.default_rng(seed), scale, observation.eef)
     integrator = TargetIntegrator(scale, observation.eef)
     observations: list[Observation] = []
     actions: list[np.ndarray] = []

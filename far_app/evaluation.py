@@ -6,24 +6,28 @@ identical for every method: a scene solved at the first attempt is solved for al
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
 import multiprocessing
-import time
+import queue
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from far_app.config import RetryConfig, from_table
 from far_app.errors import ConfigError
-from far_app.protocols import Method
 from far_app.types import Trial
 
 Job = tuple[int, dict[str, dict[str, Any]]]
 """A scene, and what is already known of it by arm."""
+Block = Sequence[Job]
+BLOCK = 16
+"""Scenes a worker takes at a time."""
 DEV_SCENES = 20_000
 """Scene seeds for choices (settings, variants)."""
 REPORT_SCENES = 30_000
@@ -113,7 +117,7 @@ def read_arms(path: Path) -> tuple[Arm, ...]:
     return tuple(arms)
 
 
-def episode_record(arm: str, scene: int, result: Trial, seconds: float) -> dict[str, Any]:
+def episode_record(arm: str, scene: int, result: Trial) -> dict[str, Any]:
     """One line of the results."""
     return {
         "arm": arm, "scene": scene, "success": result.success, "attempts": len(result.attempts),
@@ -127,26 +131,29 @@ def episode_record(arm: str, scene: int, result: Trial, seconds: float) -> dict[
             }
             for a in result.adaptations
         ],
-        "seconds": seconds,
     }  # fmt: skip
 
 
-def run_scene(
-    scene: int, arms: dict[str, Method], done: dict[str, dict[str, Any]], run: Callable[[Method, int], Trial]
+def run_block(
+    block: Block, arms: Sequence[str], run: Callable[[str, list[int]], Iterator[tuple[int, Trial]]]
 ) -> Iterator[dict[str, Any]]:
-    """The records of one scene that are still missing; a first-attempt success of one arm is every arm's."""
-    shared = next((r for r in done.values() if r["success"] and r["attempts"] == 1), None)
-    for name, method in arms.items():
-        if name in done:
-            continue
-        if shared is not None:
-            yield shared | {"arm": name, "seconds": 0.0, "shared": True}
-            continue
-        started = time.monotonic()
-        record = episode_record(name, scene, run(method, scene), time.monotonic() - started)
-        if record["success"] and record["attempts"] == 1:
-            shared = record
-        yield record
+    """The records of a block that are still missing, each as it is there; `run` runs scenes under an arm. A success at
+    the first attempt under one arm is every arm's, and is run once."""
+    known = {scene: dict(done) for scene, done in block}
+    for arm in arms:
+        missing = []
+        for scene, done in known.items():
+            shared = next((r for r in done.values() if r["success"] and r["attempts"] == 1), None)
+            if arm in done:
+                continue
+            if shared is None:
+                missing.append(scene)
+                continue
+            done[arm] = shared | {"arm": arm, "shared": True}
+            yield done[arm]
+        for scene, result in run(arm, missing):
+            known[scene][arm] = episode_record(arm, scene, result)
+            yield known[scene][arm]
 
 
 def read_results(path: Path) -> list[dict[str, Any]]:
@@ -177,33 +184,62 @@ def prepare(folder: Path, plan: EvaluationPlan) -> dict[int, dict[str, dict[str,
 
 def evaluate(
     folder: Path, plan: EvaluationPlan, workers: int, progress: Callable[[dict[str, Any]], None],
-    begin: Callable[[EvaluationPlan], None], work: Callable[[Job], list[dict[str, Any]]],
+    begin: Callable[[EvaluationPlan], None], work: Callable[[Block], Iterator[dict[str, Any]]],
 ) -> None:  # fmt: skip
-    """Run what is missing; every finished scene is on disk before the next is counted. `begin` sets a worker process
-    up, `work` runs one scene in it; both are importable functions (far_app/cli/evaluate.py)."""
+    """Run what is missing; every finished episode is on disk before the next is counted. `begin` sets a worker process
+    up, `work` runs a block of scenes in it; both are importable functions (far_app/cli/evaluate.py)."""
     found = prepare(folder, plan)
     names = {a.name for a in plan.arms}
     scenes = range(plan.first_scene, plan.first_scene + plan.scenes)
     jobs = [(s, found.get(s, {})) for s in scenes if names - set(found.get(s, {}))]
+    size = max(1, min(BLOCK, -(-len(jobs) // max(1, workers))))
+    blocks = [jobs[i : i + size] for i in range(0, len(jobs), size)]
     results = folder / "episodes.jsonl"
     if results.exists() and not (whole := results.read_bytes()).endswith(b"\n"):
         results.write_bytes(whole[: whole.rfind(b"\n") + 1])  # a killed run's torn line; its episode is run again
     with results.open("a") as file:
-        for records in _results(plan, jobs, workers, begin, work):
-            for record in records:
-                file.write(json.dumps(record) + "\n")
-                file.flush()
-                progress(record)
+        for record in _records(plan, blocks, workers, begin, work):
+            file.write(json.dumps(record) + "\n")
+            file.flush()
+            progress(record)
 
 
-def _results(
-    plan: EvaluationPlan, jobs: Sequence[Job], workers: int, begin: Callable, work: Callable
-) -> Iterator[list[dict[str, Any]]]:
-    if workers <= 1 or not jobs:
-        if jobs:
-            begin(plan)
-        yield from map(work, jobs)
+def _records(
+    plan: EvaluationPlan, blocks: Sequence[Block], workers: int, begin: Callable, work: Callable
+) -> Iterator[dict[str, Any]]:
+    if not blocks:
+        return
+    if workers <= 1:
+        begin(plan)
+        for block in blocks:
+            yield from work(block)
         return
     context = multiprocessing.get_context("spawn")
-    with context.Pool(min(workers, len(jobs)), initializer=begin, initargs=(plan,)) as pool:
-        yield from pool.imap_unordered(work, jobs)
+    told: Any = context.Queue()
+    with ProcessPoolExecutor(min(workers, len(blocks)), context, _begin_worker, (begin, plan, work, told)) as pool:
+        pending = {pool.submit(_work, block) for block in blocks}
+        expected = heard = 0
+        while pending or heard < expected:
+            with contextlib.suppress(queue.Empty):
+                while True:
+                    yield told.get(timeout=0.2)
+                    heard += 1
+            done, pending = wait(pending, timeout=0)
+            expected += sum(future.result() for future in done)  # raises a worker's error, and that one was killed
+
+
+_TELL: dict[str, Any] = {}
+
+
+def _begin_worker(begin: Callable, plan: EvaluationPlan, work: Callable, told: Any) -> None:
+    begin(plan)
+    _TELL.update(work=work, told=told)
+
+
+def _work(block: Block) -> int:
+    """In a worker: each record to the one who asked, as soon as it is there."""
+    count = 0
+    for record in _TELL["work"](block):
+        _TELL["told"].put(record)
+        count += 1
+    return count

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -31,6 +31,10 @@ class ActionScale:
     """Largest angle between a new target and the measured orientation, radians."""
     expiry: float = 0.1
     """Seconds a target stays valid."""
+
+    def repeated(self, times: int) -> ActionScale:
+        """What ±1 means where each action is repeated for so many control steps."""
+        return replace(self, translation=times * self.translation, rotation=times * self.rotation)
 
 
 def quat_multiply(a: Float[np.ndarray, "4"], b: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4"]:

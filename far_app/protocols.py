@@ -98,6 +98,10 @@ History = tuple[Observation, ...]
 """The last n_obs observations, oldest first; the first is repeated at an attempt's start."""
 
 
+OWN_STATE = ("eef_position", "eef_quaternion", "gripper")
+"""What every policy sees of the arm itself."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class PolicySpec:
     """What a policy needs to see and what it gives; compared with the robot before the first motion."""
@@ -113,6 +117,7 @@ class PolicySpec:
     image_size: int
     """Pixels, square; 0 for policies that see state only."""
     state_keys: tuple[str, ...]
+    """OWN_STATE, and the names of objects whose poses it sees."""
 
 
 @runtime_checkable

@@ -1,17 +1,58 @@
-"""The tasks, as data. A new task is one entry here."""
+"""The tasks, as data. A new task is one entry here, and an expert (far_app/experts/) if demonstrations are scripted.
+
+The paper counts policy ticks of a Panda controlled at 20 Hz, some of them repeated for three control steps; the xArm7
+at 30 Hz gets the same seconds.
+"""
 
 from __future__ import annotations
 
-from far_app.config import TaskConfig
+from dataclasses import replace
+
+from far_app.config import Arm, TaskConfig
 from far_app.errors import ConfigError
 
+PANDA_HZ = 20.0
+"""Control steps a second of the paper's simulation."""
+XARM_HZ = 30.0
+
 TASKS: dict[str, TaskConfig] = {
-    "lift": TaskConfig(name="lift", environment="Lift", horizon=150, placement=(0.12, 0.12)),
-}
+    "lift": TaskConfig(
+        name="lift", environment="Lift", horizon=100, objects=(("cube", "cube_main"),), placement=(0.12, 0.12),
+    ),
+    "stack": TaskConfig(
+        name="stack", environment="Stack", horizon=150, repeat=3,
+        objects=(("cubeA", "cubeA_main"), ("cubeB", "cubeB_main")),
+    ),
+    "door": TaskConfig(
+        name="door", environment="Door", horizon=200, repeat=3,
+        objects=(("handle", "Door_handle"), ("door", "Door_door")),
+    ),
+    "bread": TaskConfig(
+        name="bread", environment="PickPlaceBread", horizon=200, repeat=3,
+        objects=(("bread", "Bread_main"), ("bin", "bin2")),
+    ),
+    "can": TaskConfig(
+        name="can", environment="PickPlaceCan", horizon=200,
+        objects=(("can", "Can_main"), ("bin", "bin2")),
+    ),
+    "square": TaskConfig(
+        name="square", environment="NutAssemblySquare", horizon=200,
+        objects=(("nut", "SquareNut_main"), ("handle", "SquareNut_handle_site"), ("peg", "peg1")),
+    ),
+}  # fmt: skip
+"""At the paper's pace, on the Panda."""
 
 
-def task(name: str) -> TaskConfig:
-    """The entry of that name, or an error that lists the choices."""
+def task(name: str, arm: Arm = "xarm7") -> TaskConfig:
+    """The entry of that name at an arm's pace, or an error that lists the choices."""
     if name not in TASKS:
         raise ConfigError(f"unknown task '{name}'; choose one of: {', '.join(sorted(TASKS))}")
-    return TASKS[name]
+    return at_pace(TASKS[name], arm)
+
+
+def at_pace(entry: TaskConfig, arm: Arm) -> TaskConfig:
+    """The same seconds in an arm's own ticks."""
+    if arm == "panda":
+        return replace(entry, rate=PANDA_HZ / entry.repeat)
+    seconds = entry.horizon * entry.repeat / PANDA_HZ
+    return replace(entry, rate=XARM_HZ, horizon=round(seconds * XARM_HZ), repeat=1)

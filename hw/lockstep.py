@@ -26,6 +26,7 @@ class LockstepRobot:
         """Without a view observations hold no images. Unless render_homing, none are drawn while the arm goes home.
         The view stays its maker's (several robots of one rig and task may share one)."""
         self.plant, self.view, self.rig, self.task = plant, view, rig, task
+        self.scale = rig.scale_for(task)
         self.render_homing = render_homing
         self.controller = ArmController(rig, task, plant.servo_hz, plant.measure())
         self.servo_ticks = max(1, round(plant.servo_hz / task.rate))

@@ -6,7 +6,7 @@ import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from far_app.config import from_table
+from far_app.config import Arm, TaskConfig, from_table
 from far_app.errors import ConfigError
 from far_app.motion import ActionScale
 
@@ -61,6 +61,8 @@ class RigConfig:
     name: str
     robot: str
     """"twin" or "xarm"."""
+    arm: Arm = "xarm7"
+    """Which arm it is, or is the twin of."""
     start_position: tuple[float, float, float]
     """Metres, base frame."""
     start_quaternion: tuple[float, float, float, float]
@@ -78,6 +80,10 @@ class RigConfig:
     """Pixels, square."""
     operator_rate: float = 12.0
     """Operator pictures a second."""
+
+    def scale_for(self, task: TaskConfig) -> ActionScale:
+        """What ±1 means in a tick of the task."""
+        return self.scale.repeated(task.repeat)
 
 
 def load_rig(name_or_path: str) -> RigConfig:

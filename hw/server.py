@@ -63,8 +63,8 @@ def make_plant(rig: RigConfig, task: TaskConfig) -> tuple[Plant, Callable[[], Pl
     from hw.twin_view import TwinView
 
     plant = TwinPlant(rig, task)
-    xml, base = plant.model_xml(), plant.base_pose()
-    return plant, lambda: TwinView(xml, base)
+    xml, base, cameras = plant.model_xml(), plant.base_pose(), plant.cameras()
+    return plant, lambda: TwinView(xml, base, cameras)
 
 
 class Server:
@@ -133,7 +133,7 @@ class Ending:
 
 
 def serve(
-    folder: Path, rig: str, task: TaskConfig, parent: int | None, say: Callable[[dict[str, object]], None]
+    folder: Path, rig_name: str, task_name: str, parent: int | None, say: Callable[[dict[str, object]], None]
 ) -> None:
     """Runs the server to its end."""
     began = time.monotonic()
@@ -144,7 +144,9 @@ def serve(
         )
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        server = Server(load_rig(rig), task, Endpoints.in_folder(folder))
+        rig = load_rig(rig_name)
+        task = task_named(task_name, rig.arm)
+        server = Server(rig, task, Endpoints.in_folder(folder))
         server.start()
     except zmq.ZMQError as error:
         raise RobotError(f"cannot serve below {folder}: {error}; choose another folder") from error
@@ -177,7 +179,7 @@ def main(arguments: list[str] | None = None) -> int:
         handshake.flush()
 
     try:
-        serve(options.folder, options.rig, task_named(options.task), options.parent, say)
+        serve(options.folder, options.rig, options.task, options.parent, say)
     except FarError as error:
         log.error("%s", error)
         say({"error": str(error), "kind": type(error).__name__})

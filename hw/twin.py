@@ -1,4 +1,4 @@
-"""The twin: a robosuite xArm7 as a plant the controller moves at 120 Hz, in simulated time.
+"""The twin: a robosuite arm (xArm7, Panda) as a plant the controller moves at 120 Hz, in simulated time.
 
 robosuite's environment gives the model, the scene and the task's own check; stepping, timing, the arm's impedance law
 (hw/osc.py) and the gripper's speed are ours, so that one servo tick is exactly 1/120 s and targets are absolute poses.
@@ -23,14 +23,14 @@ from far_app.types import Pose
 from hw.osc import OperationalSpace
 from hw.plant import Measured
 from hw.rig import RigConfig
+from hw.twin_arms import ARMS
+from hw.twin_view import FRONT, CameraPlacement
 
 SERVO_HZ = 120
 SUBSTEPS = 4
 """Physics steps a servo tick: 1/480 s each."""
 GRIPPER_SECONDS = 0.5
 """Time of a full gripper stroke, as a UFACTORY gripper at a middling speed."""
-GRIPPER_CLOSED = 0.85
-"""Driver joint of the xArm gripper when closed, radians."""
 STIFFNESS = 600.0
 """Operational-space kp: the arm lags a moving target by 2/√kp ≈ 80 ms."""
 
@@ -40,6 +40,8 @@ class Snapshot:
     """What a view needs to draw one moment of the twin."""
 
     qpos: Float[np.ndarray, "nq"]
+    body_pos: Float[np.ndarray, "nbody 3"]
+    body_quat: Float[np.ndarray, "nbody 4"]
 
 
 def quat_wxyz_to_xyzw(q: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4"]:
@@ -47,7 +49,7 @@ def quat_wxyz_to_xyzw(q: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4"]:
     return np.array([q[1], q[2], q[3], q[0]])
 
 
-def make_environment(task: TaskConfig) -> Any:
+def make_environment(task: TaskConfig, robot: str) -> Any:
     """robosuite's environment for the task, without cameras or a renderer of its own."""
     logging.disable(logging.WARNING)  # robosuite warns at import of optional parts this program does not use
     try:
@@ -56,17 +58,26 @@ def make_environment(task: TaskConfig) -> Any:
     finally:
         logging.disable(logging.NOTSET)
     logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
-    dx, dy = task.placement
-    placement = UniformRandomSampler(
-        name="ObjectSampler", x_range=[-dx, dx], y_range=[-dy, dy], rotation=None,
-        ensure_object_boundary_in_range=False, ensure_valid_placement=True,
-        reference_pos=np.array((0.0, 0.0, 0.8)), z_offset=0.01,
-    )  # fmt: skip
+    chosen = {}
+    if task.placement is not None:
+        dx, dy = task.placement
+        chosen["placement_initializer"] = UniformRandomSampler(
+            name="ObjectSampler", x_range=[-dx, dx], y_range=[-dy, dy], rotation=None,
+            ensure_object_boundary_in_range=False, ensure_valid_placement=True,
+            reference_pos=np.array((0.0, 0.0, 0.8)), z_offset=0.01,
+        )  # fmt: skip
     return robosuite.make(
-        task.environment, robots="XArm7", placement_initializer=placement,
-        has_renderer=False, has_offscreen_renderer=False, use_camera_obs=False, reward_shaping=True,
-        initialization_noise=None, hard_reset=False, horizon=10**9, control_freq=SERVO_HZ,
+        task.environment, robots=robot, has_renderer=False, has_offscreen_renderer=False, use_camera_obs=False,
+        reward_shaping=True, initialization_noise=None, hard_reset=False, horizon=10**9, control_freq=SERVO_HZ,
+        **chosen,
     )  # fmt: skip
+
+
+def seed_placements(sampler: Any, rng: np.random.Generator) -> None:
+    """Let a placement sampler, and those it is made of, draw from this generator."""
+    sampler.rng = rng
+    for part in getattr(sampler, "samplers", {}).values():
+        seed_placements(part, rng)
 
 
 class TwinPlant:
@@ -76,12 +87,14 @@ class TwinPlant:
 
     def __init__(self, rig: RigConfig, task: TaskConfig) -> None:
         self.rig, self.task = rig, task
-        self.env = make_environment(task)
+        self.arm = ARMS[rig.arm]
+        self.env = make_environment(task, self.arm.robot)
         self._bind()
         self._grip = -1.0
         self._grip_target = -1.0
         self._ticks = 0
         self._task_check: tuple[bool, float] = (False, 0.0)
+        self._policy_tick = max(1, round(SERVO_HZ / task.rate))
         self.reset(0)
 
     def _bind(self) -> None:
@@ -93,16 +106,24 @@ class TwinPlant:
         arm = self.robot.arms[0]
         self._site = self.robot.eef_site_id[arm]
         self._arm_qpos = np.asarray(self.robot._ref_joint_pos_indexes[:7])
-        self._driver_qpos = self.model.joint("gripper0_right_left_driver_joint").qposadr[0]
+        self._finger_qpos = self.model.joint(self.arm.finger_joint).qposadr[0]
         self._arm_actuators = np.array([self.model.actuator(f"robot0_torq_j{i}").id for i in range(1, 8)])
         dofs = np.array([self.model.joint(f"robot0_joint{i}").dofadr[0] for i in range(1, 8)])
         mujoco.mj_forward(self.model, self.data)
         self.osc = OperationalSpace(self.model, self.data, self._site, dofs, self._arm_qpos, STIFFNESS)
-        self._finger_actuator = self.model.actuator("gripper0_right_fingers_actuator").id
+        self._fingers = [(self.model.actuator(name).id, opens) for name, opens in self.arm.fingers]
         base = self.model.body("robot0_base").id
         self._base_position = self.data.xpos[base].copy()
         self._base_quaternion = quat_wxyz_to_xyzw(self.data.xquat[base])
-        self._objects = {o.name: self.model.body(o.root_body).id for o in self.env.model.mujoco_objects}
+        self._objects = {name: self._place_of(element) for name, element in self.task.objects}
+
+    def _place_of(self, element: str) -> tuple[np.ndarray, np.ndarray]:
+        """World position and rotation matrix of a body or site, as views that follow the simulation."""
+        if mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, element) >= 0:
+            body = self.model.body(element).id
+            return self.data.xpos[body], self.data.xmat[body]
+        site = self.model.site(element).id
+        return self.data.site_xpos[site], self.data.site_xmat[site]
 
     def to_base(self, position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -> Pose:
         """A world pose (xyzw) in the arm's base frame."""
@@ -117,7 +138,7 @@ class TwinPlant:
         return Pose(position=rotated[:3] + self._base_position, quaternion=quat_multiply(q, pose.quaternion))
 
     def reset(self, seed: int) -> None:
-        self.env.placement_initializer.rng = np.random.default_rng(seed)
+        seed_placements(self.env.placement_initializer, np.random.default_rng(seed))
         self.env.reset()
         self._bind()
         if self.rig.start_joints:
@@ -133,19 +154,21 @@ class TwinPlant:
         self._ticks = 0
 
     def measure(self) -> Measured:
-        quaternion = np.empty(4)
-        mujoco.mju_mat2Quat(quaternion, self.data.site_xmat[self._site])
-        objects = {
-            name: self.to_base(self.data.xpos[body].copy(), quat_wxyz_to_xyzw(self.data.xquat[body]))
-            for name, body in self._objects.items()
-        }
+        objects = {name: self._pose(*place) for name, place in self._objects.items()}
         success, reward = self._task_check
+        shut, wide = self.arm.finger_closed, self.arm.finger_open
         return Measured(
-            eef=self.to_base(self.data.site_xpos[self._site].copy(), quat_wxyz_to_xyzw(quaternion)),
+            eef=self._pose(self.data.site_xpos[self._site], self.data.site_xmat[self._site]),
             joints=self.data.qpos[self._arm_qpos].copy(),
-            gripper=float(np.clip(1.0 - self.data.qpos[self._driver_qpos] / GRIPPER_CLOSED, 0.0, 1.0)),
+            gripper=float(np.clip((self.data.qpos[self._finger_qpos] - shut) / (wide - shut), 0.0, 1.0)),
             objects=objects, success=success, reward=reward,
         )  # fmt: skip
+
+    def _pose(self, position: Float[np.ndarray, "3"], matrix: Float[np.ndarray, "9"]) -> Pose:
+        """Base frame."""
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, matrix)
+        return self.to_base(position.copy(), quat_wxyz_to_xyzw(quaternion))
 
     def servo(self, pose: Pose, gripper: float) -> None:
         self.osc.aim(self.to_world(pose))
@@ -154,8 +177,10 @@ class TwinPlant:
     def advance(self) -> None:
         reach = 2.0 / (GRIPPER_SECONDS * SERVO_HZ)
         self._grip += float(np.clip(self._grip_target - self._grip, -reach, reach))
-        low, high = self.model.actuator_ctrlrange[self._finger_actuator]
-        self.data.ctrl[self._finger_actuator] = low + (self._grip + 1.0) / 2.0 * (high - low)
+        closed = (self._grip + 1.0) / 2.0
+        for finger, opens_low in self._fingers:
+            low, high = self.model.actuator_ctrlrange[finger]
+            self.data.ctrl[finger] = low + (closed if opens_low else 1.0 - closed) * (high - low)
         for i in range(SUBSTEPS):
             mujoco.mj_step1(self.model, self.data)
             if i == 0:
@@ -163,15 +188,21 @@ class TwinPlant:
             self.data.ctrl[self._arm_actuators] = self.osc.torques()
             mujoco.mj_step2(self.model, self.data)
         self._ticks += 1
-        if self._ticks % (SERVO_HZ // 30) == 0:
-            self._task_check = (bool(self.env._check_success()), float(self.env.reward()))
+        if self._ticks % self._policy_tick == 0:
+            self._task_check = (bool(self.env._check_success()), float(self.env.reward(None)))
 
     def snapshot(self) -> Snapshot:
-        return Snapshot(qpos=self.data.qpos.copy())
+        return Snapshot(
+            qpos=self.data.qpos.copy(), body_pos=self.model.body_pos.copy(), body_quat=self.model.body_quat.copy()
+        )
 
     def model_xml(self) -> str:
         """The scene as MJCF, for a view's own model."""
         return self.env.model.get_xml()
+
+    def cameras(self) -> dict[str, CameraPlacement]:
+        """Where the cameras are, by name."""
+        return {"front": FRONT, "wrist": self.arm.wrist}
 
     def base_pose(self) -> Pose:
         """The arm's base in the world."""

@@ -7,6 +7,7 @@ multisampling; without them and with each mesh thinned once at start, two 84 × 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,16 +40,7 @@ class CameraPlacement:
     body: str = "world"
 
 
-CAMERAS = {
-    "front": CameraPlacement(position=(0.62, 0.0, 1.42), target=(-0.03, 0.0, 0.93), up=(0, 0, 1), fovy=48.0),
-    "wrist": CameraPlacement(
-        position=(0.12, 0.0, 0.0),
-        target=(0.015, 0.0, 0.17),
-        up=(1, 0, 0),
-        fovy=80.0,
-        body="gripper0_right_xarm_gripper_base_link",
-    ),
-}
+FRONT = CameraPlacement(position=(0.62, 0.0, 1.42), target=(-0.03, 0.0, 0.93), up=(0, 0, 1), fovy=48.0)
 
 
 def look_at(camera: CameraPlacement) -> Float[np.ndarray, "4"]:
@@ -81,11 +73,11 @@ def thin_meshes(spec: mujoco.MjSpec, budget: int = FACE_BUDGET) -> None:
         mesh.userface = np.asarray(faces, np.int32).ravel()
 
 
-def visual_model(xml: str) -> mujoco.MjModel:
+def visual_model(xml: str, cameras: Mapping[str, CameraPlacement]) -> mujoco.MjModel:
     """The scene for drawing only: thinned meshes, our cameras, no shadows, reflections or multisampling."""
     spec = mujoco.MjSpec.from_string(xml)
     thin_meshes(spec)
-    for name, camera in CAMERAS.items():
+    for name, camera in cameras.items():
         body = spec.body(camera.body)
         body.add_camera(name=name, pos=camera.position, quat=look_at(camera), fovy=camera.fovy)
     model = spec.compile()
@@ -98,8 +90,8 @@ def visual_model(xml: str) -> mujoco.MjModel:
 class TwinView:
     """A PlantView (hw/plant.py) of TwinPlant's snapshots. Make and use it in one thread."""
 
-    def __init__(self, xml: str, base: Pose) -> None:
-        self._model = visual_model(xml)
+    def __init__(self, xml: str, base: Pose, cameras: Mapping[str, CameraPlacement]) -> None:
+        self._model = visual_model(xml, cameras)
         self._data = mujoco.MjData(self._model)
         self._base = base
         self._renderers: dict[int, mujoco.Renderer] = {}
@@ -126,6 +118,8 @@ class TwinView:
     def _place(self, snapshot: Any) -> None:
         if snapshot is not self._drawn:
             self._data.qpos[:] = snapshot.qpos
+            self._model.body_pos[:] = snapshot.body_pos  # a scene may move what is not a joint (a door, a bin)
+            self._model.body_quat[:] = snapshot.body_quat
             mujoco.mj_kinematics(self._model, self._data)
             mujoco.mj_camlight(self._model, self._data)
             self._drawn = snapshot

@@ -7,7 +7,7 @@ import pytest
 
 from far_app.config import FCPAConfig, RetryConfig
 from far_app.errors import ConfigError
-from far_app.evaluation import Arm, EvaluationPlan, differences, evaluate, read_arms, read_results, run_scene
+from far_app.evaluation import Arm, EvaluationPlan, differences, evaluate, read_arms, read_results, run_block
 from far_app.types import Attempt, Judge, Outcome, Trial
 
 PLAN = EvaluationPlan(
@@ -22,10 +22,12 @@ def begin(plan):
     BEGUN.append(plan.task)
 
 
-def work(job):
-    scene, done = job
-    WORKED.append(scene)
-    return [{"arm": a, "scene": scene, "success": True, "attempts": 1} for a in ("nr", "far") if a not in done]
+def work(block):
+    for scene, done in block:
+        WORKED.append(scene)
+        for arm in ("nr", "far"):
+            if arm not in done:
+                yield {"arm": arm, "scene": scene, "success": True, "attempts": 1}
 
 
 def test_a_second_start_does_only_what_is_missing(tmp_path):
@@ -51,16 +53,17 @@ def test_results_of_another_plan_are_refused(tmp_path):
 def test_a_first_attempt_success_is_run_once():
     calls = []
 
-    def run(method, scene):
-        calls.append(method)
-        outcome = Outcome(success=True, judged_by=Judge.TWIN)
-        attempt = Attempt(index=1, scene_seed=scene, steps=(), final=None, outcome=outcome, policy_version="base")
-        return Trial(scene_seed=scene, attempts=(attempt,), adaptations=())
+    def run(arm, scenes):
+        calls.append((arm, list(scenes)))
+        for scene in scenes:
+            outcome = Outcome(success=scene == 5, judged_by=Judge.TWIN)
+            attempt = Attempt(index=1, scene_seed=scene, steps=(), final=None, outcome=outcome, policy_version="base")
+            yield scene, Trial(scene_seed=scene, attempts=(attempt,), adaptations=())
 
-    records = list(run_scene(5, {"nr": "m1", "far": "m2"}, {}, run))
-    assert calls == ["m1"]
-    assert [r["arm"] for r in records] == ["nr", "far"]
-    assert records[1]["shared"]
+    records = list(run_block([(5, {}), (6, {}), (7, {"nr": {"success": False, "attempts": 1}})], ["nr", "far"], run))
+    assert calls == [("nr", [5, 6]), ("far", [6, 7])]
+    assert [(r["arm"], r["scene"]) for r in records] == [("nr", 5), ("nr", 6), ("far", 5), ("far", 6), ("far", 7)]
+    assert [r.get("shared", False) for r in records] == [False, False, True, False, False]
 
 
 def written(folder, text):

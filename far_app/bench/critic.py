@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import tyro
 from jaxtyping import Float
+from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from far_app.bench.report import write
@@ -23,6 +24,7 @@ from far_app.config import RetryConfig
 from far_app.errors import ConfigError, FarError
 from far_app.evaluation import DEV_SCENES
 from far_app.types import ACTION_DIM, Attempt
+from hw.rig import load_rig
 
 NEAR = 0.03
 """Metres from the object within which nearer is no longer better."""
@@ -77,7 +79,7 @@ def measure(options: CriticOptions) -> dict[str, Any]:
     from far_app.trial import trial
 
     torch.set_num_threads(1)
-    task = dataclasses.replace(find_task(options.task), max_attempts=1)
+    task = dataclasses.replace(find_task(options.task, load_rig(options.rig).arm), max_attempts=1)
     policy = options.policy or shipped(task.name, "policy")
     critic = options.critic or (
         policy.with_name("critic.safetensors") if options.policy else shipped(task.name, "critic")
@@ -85,13 +87,13 @@ def measure(options: CriticOptions) -> dict[str, Any]:
     network, judge = trained(policy, critic, task.name, "cpu", needs_critic=True)
     assert judge is not None
     method = assemble("nr", task, str(policy), critic, "cpu", RetryConfig()).method
-    robot = lockstep_twin(options.rig, task)
+    robot = lockstep_twin(options.rig, task, bool(network.config.cameras))
     states: list[Ranking] = []
     failures, scene = 0, options.first_scene
     with tqdm(total=options.failures, unit="failure", leave=False) as bar:
         while failures < options.failures:
             result = run_lockstep(
-                trial(scene, robot, LockstepPlanner(), method, TwinCheck(task.success_ticks), task, robot.rig.scale,
+                trial(scene, robot, LockstepPlanner(), method, TwinCheck(task.success_ticks), task, robot.scale,
                       adapt_at_once), robot.advance,
             )  # fmt: skip
             scene += 1
@@ -109,7 +111,7 @@ def measure(options: CriticOptions) -> dict[str, Any]:
                     features = network.encode(seen)
                     chunks = network.sample(features.expand(options.samples, -1), torch.from_numpy(noise))
                     scores = judge.q(judge.see(seen, features).expand(options.samples, -1), chunks)
-                ahead = robot.rig.scale.translation * chunks[:, :, :3].clamp(-1, 1).sum(1).numpy()
+                ahead = robot.scale.translation * chunks[:, :, :3].clamp(-1, 1).sum(1).numpy()
                 states.append(Ranking.of(offset(attempt, tick), ahead, scores.numpy()))
     if not states:
         raise FarError(f"in {failures} failed attempts the open hand was never away from the object: nothing to rank")
@@ -141,11 +143,10 @@ class Ranking:
     ) -> Ranking:
         """`offset`: from the hand to the object; `ahead`: where each chunk would move the hand, both metres."""
         progress = np.linalg.norm(offset) - np.linalg.norm(offset - ahead, axis=1)
-        ranks = [np.argsort(np.argsort(x)) for x in (progress, scores)]
         best = np.argsort(-scores)[:BEST]
         return cls(
             spread=float(np.sqrt(((ahead - ahead.mean(0)) ** 2).sum(1).mean())),
-            correlation=float(np.corrcoef(ranks)[0, 1]),
+            correlation=float(np.asarray(spearmanr(progress, scores))[0]),
             gain=float(progress[best].mean() - progress.mean()),
         )
 

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from far_app.config import RetryConfig, TaskConfig
 from far_app.errors import CheckpointError, ConfigError
-from far_app.protocols import Method, PolicySpec
+from far_app.protocols import OWN_STATE, Method, PolicySpec
 from far_app.types import Observation
 
 if TYPE_CHECKING:
     from far_app.learning.critic import Critic
     from far_app.learning.engines import Engine
     from far_app.learning.policy import DiffusionPolicy
+    from far_app.learning.steering import Steering
 
 UNTRAINED = "untrained:"
 """--policy untrained:PRESET gives random weights."""
@@ -31,6 +33,8 @@ class Parts:
     """Checkpoint, for people and the recording."""
     max_attempts: int | None
     """Attempts a trial where the method fixes them."""
+    another: Callable[[], Method]
+    """One more method of the same parts, for a trial beside; the base policy is shared, so that they plan together."""
 
 
 def shipped(task: str, kind: str) -> Path:
@@ -46,17 +50,21 @@ def assemble(
     device: str,
     retry: RetryConfig,
     engine: Engine = "auto",
+    lanes: int | None = None,
 ) -> Parts:
-    """Load what a method needs and warm it up. Raises ConfigError or CheckpointError."""
+    """Load what a method needs and warm it up; `lanes`: trials that will share the base policy's batches. Raises
+    ConfigError or CheckpointError."""
     if policy is not None and policy.startswith("test:"):
         from far_app.cli._scripted import ScriptedMethod
 
-        return Parts(method=ScriptedMethod(policy.removeprefix("test:")), policy_name=policy, max_attempts=None)
+        scripted = ScriptedMethod(policy.removeprefix("test:"))
+        return Parts(method=scripted, policy_name=policy, max_attempts=None, another=lambda: scripted)
 
     from far_app.learning.critic_file import load_demonstrations
     from far_app.learning.runtime import ActingPolicy
     from far_app.methods import METHODS, Ingredients
     from far_app.methods import method as make_method
+    from far_app.methods.retry import BASE_VERSION
 
     if method not in METHODS:
         raise ConfigError(f"unknown method '{method}'; choose one of: {', '.join(METHODS)}")
@@ -73,16 +81,24 @@ def assemble(
         network, critic_network = trained(path, critic or beside, task.name, device, entry.needs_critic)
         if (retry.fcpa.guard == "bc" or entry.needs_demonstrations) and critic_network is not None:
             demonstrations = load_demonstrations(critic or beside, network)
-    made = make_method(
-        method,
-        Ingredients(
-            network=network, critic=critic_network, config=retry, demonstrations=demonstrations,
-            act=lambda network, version, steering=None: ActingPolicy(
-                network, version, critic_network, engine, steering
-            ),
-        ),
+    base: dict[str, ActingPolicy] = {}
+
+    def act(network: DiffusionPolicy, version: str, steering: Steering | None = None) -> ActingPolicy:
+        if version == BASE_VERSION and version in base:
+            return base[version]
+        batch = lanes if version == BASE_VERSION else None
+        policy = ActingPolicy(network, version, critic_network, engine, steering, batch)
+        if version == BASE_VERSION:
+            base[version] = policy
+        return policy
+
+    ingredients = Ingredients(
+        network=network, critic=critic_network, config=retry, demonstrations=demonstrations, act=act
+    )
+    return Parts(
+        method=make_method(method, ingredients), policy_name=name, max_attempts=entry.attempts,
+        another=lambda: make_method(method, ingredients),
     )  # fmt: skip
-    return Parts(method=made, policy_name=name, max_attempts=entry.attempts)
 
 
 def trained(
@@ -126,6 +142,12 @@ def check_device(device: str) -> None:
 
 def check_observation(spec: PolicySpec, observation: Observation) -> None:
     """What the policy needs to see against what the robot shows, before the first motion. Raises CheckpointError."""
+    unseen = [key for key in spec.state_keys if key not in OWN_STATE and key not in observation.objects]
+    if unseen:
+        raise CheckpointError(
+            f"policy {spec.name} sees the pose of {', '.join(unseen)}, the robot tells of "
+            f"{', '.join(observation.objects) or 'no objects'}; give a policy that looks through cameras"
+        )
     for camera in spec.cameras:
         image = observation.images.get(camera)
         if image is None:

@@ -22,6 +22,7 @@ from far_app.learning.dataset import count_episodes, episode_of, last_scene, wri
 from far_app.tasks import task as find_task
 from far_app.types import Observation
 from hw.lockstep import LockstepRobot
+from hw.rig import load_rig
 
 log = logging.getLogger(__name__)
 
@@ -43,15 +44,18 @@ class DemoOptions:
     """With --policy: standard deviation of smoothed perturbations of the translation, in action units. A critic learns
     from them what other actions would have led to."""
     rig: str = "twin"
+    images: bool = True
+    """Draw the cameras; a policy of the `state` preset needs none."""
 
 
 def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(DemoOptions, args=list(arguments), prog="far demo")
-    task = find_task(options.task)
-    robot = lockstep_twin(options.rig, task)
+    task = find_task(options.task, load_rig(options.rig).arm)
+    robot = lockstep_twin(options.rig, task, options.images)
     path = options.out or Path("datasets") / f"{task.name}.hdf5"
     env_args = {
-        "env_name": task.environment, "type": 1, "env_kwargs": {"robots": "XArm7", "rig": dataclasses.asdict(robot.rig)}
+        "env_name": task.environment, "type": 1,
+        "env_kwargs": {"robots": robot.rig.arm, "rig": dataclasses.asdict(robot.rig)},
     }  # fmt: skip
     attempt = policy_attempt(options.policy, task, robot, options.explore) if options.policy is not None else None
     scene = SEED_OFFSET + options.seed + last_scene(path)
@@ -61,7 +65,7 @@ def main(arguments: Sequence[str]) -> int:
             if attempt is not None:
                 seen, done, success = attempt(scene)
             else:
-                seen, done, success = demonstrate(robot, robot.advance, task, robot.rig.scale, scene)
+                seen, done, success = demonstrate(robot, robot.advance, task, robot.scale, scene)
             failures += not success
             if success or attempt is not None:
                 objects = np.array(
@@ -99,7 +103,7 @@ def policy_attempt(
 
     def attempt(scene: int) -> Recorded:
         events = trial(
-            scene, robot, LockstepPlanner(), method, TwinCheck(task.success_ticks), once, robot.rig.scale, adapt_at_once
+            scene, robot, LockstepPlanner(), method, TwinCheck(task.success_ticks), once, robot.scale, adapt_at_once
         )
         (first,) = run_lockstep(events, robot.advance).attempts
         actions = [s.sent if np.isfinite(s.sent).all() else s.commanded for s in first.steps]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 from tqdm import tqdm
 
 from far_app.cli.assemble import assemble, shipped
-from far_app.cli.lockstep_twin import lockstep_twin
+from far_app.cli.lockstep_twin import lockstep_twins
 from far_app.cli.settings import Settings, parse
 from far_app.config import RetryConfig
 from far_app.errors import RobotError
@@ -20,17 +20,17 @@ from far_app.evaluation import (
     DEV_SCENES,
     REPORT_SCENES,
     Arm,
+    Block,
     EvaluationPlan,
-    Job,
     evaluate,
     read_arms,
     read_results,
-    run_scene,
+    run_block,
 )
-from far_app.protocols import Method, Resume
+from far_app.protocols import Resume
 from far_app.tasks import task as find_task
-from far_app.trial import Event
 from far_app.types import Trial
+from hw.rig import load_rig
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ class EvaluationOptions:
 
 def main(arguments: Sequence[str]) -> int:
     options = parse(EvaluationOptions, arguments, "far eval")
-    task = find_task(options.task)
+    task = find_task(options.task, load_rig(options.rig).arm)
     policy = options.policy or shipped(task.name, "policy")
     critic = options.critic or (
         policy.with_name("critic.safetensors") if options.policy else shipped(task.name, "critic")
@@ -102,40 +102,52 @@ def summary(folder: Path, plan: EvaluationPlan) -> str:
 
 
 _WORKER: dict[str, Any] = {}
+LANES = 8
+"""Trials side by side in a worker: a chunk in a batch of eight costs a fraction of one alone."""
 
 
 def begin(plan: EvaluationPlan) -> None:
-    """Once a worker process: the twin, the networks, the methods; one thread each."""
+    """Once a worker process: twins, networks, methods; one thread each."""
     import torch
 
     torch.set_num_threads(1)
-    task = dataclasses.replace(find_task(plan.task), max_attempts=plan.max_attempts)
-    arms = {a.name: assemble(a.method, task, plan.policy, Path(plan.critic), "cpu", a.retry).method for a in plan.arms}
-    _WORKER.update(task=task, robot=lockstep_twin(plan.rig, task), arms=arms)
+    rig = load_rig(plan.rig)
+    task = dataclasses.replace(find_task(plan.task, rig.arm), max_attempts=plan.max_attempts)
+    parts = {
+        a.name: assemble(a.method, task, plan.policy, Path(plan.critic), "cpu", a.retry, lanes=LANES) for a in plan.arms
+    }
+    images = any(p.method.policy.spec.cameras for p in parts.values())
+    robots = lockstep_twins(plan.rig, task, min(LANES, plan.scenes), images)
+    methods = {name: [p.another() for _ in robots] for name, p in parts.items()}
+    _WORKER.update(task=task, robots=robots, methods=methods)
 
 
-def work(job: Job) -> list[dict[str, Any]]:
-    """One scene under every arm that lacks it."""
+def work(block: Block) -> Iterator[dict[str, Any]]:
+    """The missing records of a block of scenes."""
+    yield from run_block(block, list(_WORKER["methods"]), run_scenes)
+
+
+def run_scenes(arm: str, scenes: list[int]) -> Iterator[tuple[int, Trial]]:
+    """Trials of one arm, side by side on this worker's twins."""
     from far_app.detectors import TwinCheck
-    from far_app.session.lockstep import adapt_at_once, run_lockstep
+    from far_app.session.lockstep import Advance, Lane, adapt_at_once, run_together
     from far_app.session.planners import LockstepPlanner
-    from far_app.trial import Adapted, AttemptEnded, trial
+    from far_app.trial import TrialEvents, trial
 
-    scene, done = job
-    robot, task = _WORKER["robot"], _WORKER["task"]
+    task, robots, methods = _WORKER["task"], _WORKER["robots"], _WORKER["methods"][arm]
 
-    def run(method: Method, seed: int) -> Trial:
+    def start(scene: int, lane: int) -> tuple[TrialEvents, Advance]:
+        robot = robots[lane]
         events = trial(
-            seed, robot, LockstepPlanner(), method, TwinCheck(task.success_ticks), task, robot.rig.scale, adapt_at_once
-        )
-        heard: list[Event] = []
-        try:
-            return run_lockstep(events, robot.advance, heard.append)
-        except RobotError as error:  # the arm latched (it could not get home, say): the trial ends as it stands
-            log.warning("scene %d, %s: %s", seed, method.name, error)
-            robot.request(Resume())
-            attempts = tuple(e.attempt for e in heard if isinstance(e, AttemptEnded))
-            adaptations = tuple(e.adaptation for e in heard if isinstance(e, Adapted))
-            return Trial(scene_seed=seed, attempts=attempts, adaptations=adaptations)
+            scene, robot, LockstepPlanner(), methods[lane], TwinCheck(task.success_ticks), task, robot.scale,
+            adapt_at_once,
+        )  # fmt: skip
+        robot.request(Resume())
+        return events, robot.advance
 
-    return list(run_scene(scene, _WORKER["arms"], done, run))
+    def failed(lane: Lane, error: RobotError) -> Trial:
+        """The arm latched (it could not get home, say): the trial ends as it stands."""
+        log.warning("scene %d, %s: %s", lane.job, arm, error)
+        return Trial(scene_seed=lane.job, attempts=tuple(lane.attempts), adaptations=tuple(lane.adaptations))
+
+    return run_together(scenes, len(robots), start, failed)

@@ -9,12 +9,19 @@ from hw.lockstep import LockstepRobot
 from hw.rig import load_rig
 
 
-def lockstep_twin(rig_name: str, task: TaskConfig) -> LockstepRobot:
-    """One twin with its own view; the software renderer stays on one thread, so that processes scale over cores."""
+def lockstep_twin(rig_name: str, task: TaskConfig, images: bool = True) -> LockstepRobot:
+    """One twin, with a view of its own where images are wanted."""
+    return lockstep_twins(rig_name, task, 1, images)[0]
+
+
+def lockstep_twins(rig_name: str, task: TaskConfig, count: int, images: bool = True) -> list[LockstepRobot]:
+    """Several twins of one scene that share a view; the software renderer stays on one thread, so that processes
+    scale over cores."""
     os.environ.setdefault("LP_NUM_THREADS", "1")
     from hw.twin import TwinPlant
     from hw.twin_view import TwinView
 
     rig = load_rig(rig_name)
-    plant = TwinPlant(rig, task)
-    return LockstepRobot(plant, TwinView(plant.model_xml(), plant.base_pose()), rig, task)
+    plants = [TwinPlant(rig, task) for _ in range(count)]
+    view = TwinView(plants[0].model_xml(), plants[0].base_pose(), plants[0].cameras()) if images else None
+    return [LockstepRobot(plant, view, rig, task) for plant in plants]

@@ -89,7 +89,7 @@ class Stage:
                         adaptation_limit=options.retry.adaptation_limit,
                     ),
                     robot=self.robot, planner=ThreadedPlanner(), method=method or self.parts.method,
-                    detector=TwinCheck(self.task.success_ticks), task=self.task, scale=self.rig.scale,
+                    detector=TwinCheck(self.task.success_ticks), task=self.task, scale=self.rig.scale_for(self.task),
                     recorder=Recorder(writer), inbox=inbox, statistics=statistics, publisher=publisher,
                 )  # fmt: skip
         finally:
@@ -100,7 +100,8 @@ class Stage:
 @contextlib.contextmanager
 def stage(options: RunOptions) -> Iterator[Stage]:
     """Start everything, wait until it is ready, end everything. Raises the FarError of whatever cannot start."""
-    task, rig = find_task(options.task), load_rig(options.rig)
+    rig = load_rig(options.rig)
+    task = find_task(options.task, rig.arm)
     port = 0 if options.headless else choose_port(options.host, options.port)
     with run_folder() as folder, contextlib.ExitStack() as stack:
         family = Family()

@@ -16,6 +16,7 @@ from far_app.learning.critic import Critic
 from far_app.learning.dataset import Episode
 from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.segments import segment_features
+from far_app.learning.state import states_of
 from far_app.learning.transitions import Backup, EncodedEpisode, RewardKind, Transitions, joined, transitions
 
 Batch = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -33,13 +34,13 @@ class Source(Protocol):
 def encoded(policy: DiffusionPolicy, episode: Episode, ticks_at_once: int = 64) -> EncodedEpisode:
     """An episode of N observed ticks as N − 1 transitions: a reward and a success belong to the action before them."""
     n_obs, ticks = policy.config.n_obs, len(episode)
-    parts = []
+    parts, states = [], states_of(episode, policy.config.objects)
     for start in range(0, ticks, ticks_at_once):
         end = min(start + ticks_at_once, ticks)
         frames = np.clip(np.arange(start - n_obs + 1, end), 0, None)
         images = {c: torch.from_numpy(episode.images[c][frames])[None] for c in policy.config.cameras}
         with torch.no_grad():
-            parts.append(segment_features(policy, images, torch.from_numpy(episode.states[frames])[None]).numpy())
+            parts.append(segment_features(policy, images, torch.from_numpy(states[frames])[None]).numpy())
     return with_features(episode, np.concatenate(parts))
 
 

@@ -83,7 +83,7 @@ def last_scene(path: Path) -> int:
 def read_episodes(path: Path, cameras: tuple[str, ...], limit: int | None = None) -> list[Episode]:
     """The first `limit` demonstrations, decoded."""
     if not path.exists():
-        raise RecordingError(f"no demonstrations at {path}; make some with `far demo --task lift --n 60`")
+        raise RecordingError(f"no demonstrations at {path}; make some with `far demo`")
     episodes = []
     with h5py.File(path, "r") as file:
         names = sorted(file["data"], key=lambda name: int(name.removeprefix("demo_")))[:limit]

@@ -23,12 +23,12 @@ from torch import Tensor, nn
 from far_app.errors import CheckpointError, ConfigError
 from far_app.learning.diffusion import ddim_sample
 from far_app.learning.encoder import ObservationEncoder
+from far_app.learning.state import state_dim, state_of
 from far_app.learning.unet import ConditionalUnet1d
-from far_app.protocols import History, PolicySpec
-from far_app.types import ACTION_DIM, Observation
+from far_app.protocols import OWN_STATE, History, PolicySpec
+from far_app.tasks import TASKS
+from far_app.types import ACTION_DIM
 
-STATE_KEYS = ("eef_position", "eef_quaternion", "gripper")
-STATE_DIM = 8
 FORMAT = "far-policy-1"
 
 
@@ -39,11 +39,13 @@ class PolicyConfig:
     preset: str
     task: str
     encoder: str
-    """"light" or "resnet18"."""
+    """"light", "resnet18", or "none" for a policy without cameras."""
     norm: str = "group"
     """Normalisation in a ResNet: "group" (16 channels a group) or "batch"."""
     cameras: tuple[str, ...] = ("front", "wrist")
     image_size: int = 84
+    objects: tuple[str, ...] = ()
+    """Whose poses are part of the state: the task's, in the `state` preset."""
     n_obs: int = 2
     """[s_{t−1}, s_t] (paper, Network Architecture)."""
     horizon: int = 8
@@ -54,7 +56,8 @@ class PolicyConfig:
     ddim_steps: int = 16
 
 
-PRESETS = {
+PRESETS: dict[str, dict[str, Any]] = {
+    "state": {"encoder": "none", "cameras": (), "widths": (64, 128, 256), "ddim_steps": 16},
     "quickstart": {"encoder": "light", "widths": (64, 128, 256), "ddim_steps": 8},
     "paper": {"encoder": "resnet18", "widths": (64, 128, 256), "ddim_steps": 16},
 }
@@ -64,29 +67,26 @@ def preset(name: str, task: str) -> PolicyConfig:
     """A preset for a task, or an error that lists the presets."""
     if name not in PRESETS:
         raise ConfigError(f"unknown preset '{name}'; choose one of: {', '.join(PRESETS)}")
-    return PolicyConfig(preset=name, task=task, **PRESETS[name])
-
-
-def proprioception(observation: Observation) -> Float[np.ndarray, "8"]:
-    """End-effector position (m) and quaternion (xyzw), gripper opening."""
-    eef = observation.eef
-    return np.concatenate([eef.position, eef.quaternion, [observation.gripper]]).astype(np.float32)
+    chosen = dict(PRESETS[name])
+    if not chosen.get("cameras", True):
+        chosen["objects"] = tuple(name for name, _ in TASKS[task].objects)
+    return PolicyConfig(preset=name, task=task, **chosen)
 
 
 class Normalizer(nn.Module):
-    """State to [−1, 1] by the demonstrations' range; quaternions are flipped to the demonstrations' hemisphere."""
+    """State to [−1, 1] by the demonstrations' range; the hand's quaternion is flipped to their hemisphere."""
 
     low: Tensor
     high: Tensor
     hemisphere: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, dim: int) -> None:
         super().__init__()
-        self.register_buffer("low", torch.full((STATE_DIM,), -1.0))
-        self.register_buffer("high", torch.full((STATE_DIM,), 1.0))
+        self.register_buffer("low", torch.full((dim,), -1.0))
+        self.register_buffer("high", torch.full((dim,), 1.0))
         self.register_buffer("hemisphere", torch.tensor([0.0, 1.0, 0.0, 0.0]))
 
-    def fit(self, states: Float[np.ndarray, "N 8"]) -> None:
+    def fit(self, states: Float[np.ndarray, "N D"]) -> None:
         """Ranges from the demonstrations; a component that hardly moves keeps a range of at least 0.02."""
         self.hemisphere.copy_(torch.as_tensor(states[0, 3:7]))
         upright = self.aligned(torch.as_tensor(states))
@@ -95,11 +95,11 @@ class Normalizer(nn.Module):
         self.low.copy_(middle - half)
         self.high.copy_(middle + half)
 
-    def aligned(self, state: Float[Tensor, "*B 8"]) -> Float[Tensor, "*B 8"]:
+    def aligned(self, state: Float[Tensor, "*B D"]) -> Float[Tensor, "*B D"]:
         sign = torch.where((state[..., 3:7] * self.hemisphere).sum(-1, keepdim=True) < 0, -1.0, 1.0)
         return torch.cat([state[..., :3], sign * state[..., 3:7], state[..., 7:]], dim=-1)
 
-    def forward(self, state: Float[Tensor, "*B 8"]) -> Float[Tensor, "*B 8"]:
+    def forward(self, state: Float[Tensor, "*B D"]) -> Float[Tensor, "*B D"]:
         return (2.0 * (self.aligned(state) - self.low) / (self.high - self.low) - 1.0).clamp(-1.5, 1.5)
 
 
@@ -109,9 +109,9 @@ class DiffusionPolicy(nn.Module):
     def __init__(self, config: PolicyConfig) -> None:
         super().__init__()
         self.config = config
-        self.normalizer = Normalizer()
+        self.normalizer = Normalizer(state_dim(config.objects))
         self.encoder = ObservationEncoder(
-            config.encoder, config.cameras, config.image_size, config.n_obs, STATE_DIM, config.norm
+            config.encoder, config.cameras, config.image_size, config.n_obs, state_dim(config.objects), config.norm
         )
         self.denoiser = ConditionalUnet1d(
             ACTION_DIM, self.encoder.dim, widths=config.widths, kernel=config.kernel, step_dim=config.step_dim
@@ -125,11 +125,11 @@ class DiffusionPolicy(nn.Module):
         c = self.config
         return PolicySpec(
             name=f"{c.preset}-{c.task}", task=c.task, horizon=c.horizon, n_obs=c.n_obs, action_dim=ACTION_DIM,
-            cameras=c.cameras, image_size=c.image_size, state_keys=STATE_KEYS,
+            cameras=c.cameras, image_size=c.image_size if c.cameras else 0, state_keys=(*OWN_STATE, *c.objects),
         )  # fmt: skip
 
     def features(
-        self, images: dict[str, UInt8[Tensor, "B T S S 3"]], state: Float[Tensor, "B T 8"]
+        self, images: dict[str, UInt8[Tensor, "B T S S 3"]], state: Float[Tensor, "B T D"]
     ) -> Float[Tensor, "B F"]:
         """The condition of the denoiser and the input of the critic."""
         return self.encoder(images, self.normalizer(state))
@@ -141,9 +141,14 @@ class DiffusionPolicy(nn.Module):
             c: torch.from_numpy(np.stack([np.stack([o.images[c] for o in h]) for h in histories])).to(device)
             for c in self.config.cameras
         }
-        state = torch.from_numpy(np.stack([np.stack([proprioception(o) for o in h]) for h in histories])).to(device)
+        state = self.states(histories)
         with torch.no_grad():
             return self.features(images, state)
+
+    def states(self, histories: Sequence[History]) -> Float[Tensor, "B T D"]:
+        """What the policy sees beside pictures, not yet normalised."""
+        stacked = np.stack([np.stack([state_of(o, self.config.objects) for o in h]) for h in histories])
+        return torch.from_numpy(stacked).to(self.normalizer.low.device)
 
     def sample(self, features: Float[Tensor, "B F"], noise: Float[Tensor, "B H A"]) -> Float[Tensor, "B H A"]:
         """Chunks in [−1, 1], denoised from the given noise."""

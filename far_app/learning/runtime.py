@@ -18,7 +18,7 @@ from far_app.errors import PolicyError
 from far_app.learning.critic import Critic
 from far_app.learning.diffusion import ddim_sample
 from far_app.learning.engines import Engine, runner
-from far_app.learning.policy import DiffusionPolicy, proprioception
+from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.steering import Steering, more_noise
 from far_app.protocols import History, PolicySpec
 from far_app.types import ActionChunk, Observation
@@ -37,7 +37,11 @@ class ActingPolicy:
         critic: Critic | None = None,
         engine: Engine = "auto",
         steering: Steering | None = None,
+        batch: int | None = None,
     ) -> None:
+        """`batch`: plan in batches of exactly so many, the last one filled up. A matrix product rounds differently in
+        another shape, and a chunk must not depend on what it happens to be planned beside."""
+        self.batch = batch
         self.network, self.critic, self.version, self.steering = network, critic, version, steering
         self.spec: PolicySpec = network.spec()
         self.device = network.normalizer.low.device
@@ -47,6 +51,19 @@ class ActingPolicy:
     def plan(
         self, histories: Sequence[History], ticks: Sequence[int], noise: Float[np.ndarray, "B H A"]
     ) -> list[ActionChunk]:
+        if self.batch is None:
+            return self._planned(histories, ticks, noise)
+        chunks: list[ActionChunk] = []
+        for first in range(0, len(histories), self.batch):
+            rows = np.minimum(np.arange(first, first + self.batch), len(histories) - 1)
+            some = self._planned([histories[i] for i in rows], [ticks[i] for i in rows], noise[rows])
+            chunks += some[: len(histories) - first]
+        return chunks
+
+    def _planned(
+        self, histories: Sequence[History], ticks: Sequence[int], noise: Float[np.ndarray, "B H A"]
+    ) -> list[ActionChunk]:
+        """In one batch."""
         with torch.inference_mode():
             features = self.features(histories)
             condition = self._denoiser.condition(features)
@@ -95,14 +112,11 @@ class ActingPolicy:
             [torch.cat([self._kept[id(h[t])][1][c] for h in histories]) for c in range(len(network.config.cameras))]
             for t in range(network.config.n_obs)
         ]
-        state = torch.from_numpy(np.stack([np.stack([proprioception(o) for o in h]) for h in histories])).to(
-            self.device
-        )
-        return network.encoder.join(frames, network.normalizer(state))
+        return network.encoder.join(frames, network.normalizer(network.states(histories)))
 
     def _encode_new(self, observations: Sequence[Observation]) -> None:
-        new = list({id(o): o for o in observations if id(o) not in self._kept}.values())
-        if new:
+        unseen = list({id(o): o for o in observations if id(o) not in self._kept}.values())
+        for new in [unseen] if self.batch is None else [[o] for o in unseen]:
             per_camera = [
                 self.network.encoder.camera_features(
                     c, 0, torch.from_numpy(np.stack([o.images[c] for o in new])).to(self.device)

@@ -15,6 +15,7 @@ from torch import Tensor
 from far_app.errors import ConfigError
 from far_app.learning.dataset import Episode
 from far_app.learning.policy import DiffusionPolicy, PolicyConfig
+from far_app.learning.state import states_of
 
 Segments = tuple[dict[str, Tensor], Tensor, Tensor, Tensor | None]
 
@@ -32,7 +33,7 @@ class DemonstrationArrays:
         self.images = {
             c: np.concatenate([np.pad(e.images[c], pad, mode="edge") for e in episodes]) for c in config.cameras
         }
-        self.states = np.concatenate([e.states for e in episodes])
+        self.states = np.concatenate([states_of(e, config.objects) for e in episodes])
         self.actions = np.concatenate([e.actions for e in episodes])
         self.offsets = object_offsets(episodes)
         self.ends = np.repeat(self.starts + self.lengths - 1, self.lengths)

@@ -5,18 +5,21 @@ Called by tests, benchmarks and evaluations; the robot lives in the same process
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 
+from far_app.errors import RobotError
 from far_app.protocols import Method, PlanRequest
-from far_app.session.planners import plan_one
-from far_app.trial import Event, RunningAdaptation, Tick, TrialEvents
-from far_app.types import Adaptation, Attempt, Trial
+from far_app.session.planners import plan_one, plan_together
+from far_app.trial import Adapted, AttemptEnded, Event, RunningAdaptation, Tick, TrialEvents
+from far_app.types import ActionChunk, Adaptation, Attempt, Trial
+
+Advance = Callable[[], float]
+"""Lets one tick of a robot's time pass and returns the new time, seconds."""
 
 
-def run_lockstep(
-    events: TrialEvents, advance: Callable[[], float], listen: Callable[[Event], None] = lambda event: None
-) -> Trial:
-    """Drive one trial to its end. `advance` lets one tick of robot time pass and returns the new time, seconds."""
+def run_lockstep(events: TrialEvents, advance: Advance, listen: Callable[[Event], None] = lambda event: None) -> Trial:
+    """Drive one trial to its end."""
     answer = None
     while True:
         try:
@@ -30,6 +33,67 @@ def run_lockstep(
             answer = plan_one(event)
         else:
             answer = None
+
+
+@dataclass
+class Lane:
+    """A trial that is under way beside others."""
+
+    job: int
+    events: TrialEvents
+    advance: Advance
+    answer: float | ActionChunk | None = None
+    attempts: list[Attempt] = field(default_factory=list)
+    adaptations: list[Adaptation] = field(default_factory=list)
+
+    def step(self) -> PlanRequest | Trial:
+        """On to where it needs a chunk, or to its end. Raises what the trial raises."""
+        while True:
+            try:
+                event = self.events.send(self.answer)
+            except StopIteration as end:
+                return end.value
+            self.answer = None
+            if isinstance(event, Tick):
+                self.answer = self.advance()
+            elif isinstance(event, PlanRequest):
+                return event
+            elif isinstance(event, AttemptEnded):
+                self.attempts.append(event.attempt)
+            elif isinstance(event, Adapted):
+                self.adaptations.append(event.adaptation)
+
+
+Start = Callable[[int, int], tuple[TrialEvents, Advance]]
+"""(job, lane) → its trial, on that lane's robot."""
+
+
+def run_together(
+    jobs: Iterable[int], lanes: int, start: Start, failed: Callable[[Lane, RobotError], Trial]
+) -> Iterator[tuple[int, Trial]]:
+    """Drive many trials side by side, each lane one after the other, so that they share batches of inference. Yields
+    each as it ends; `failed` makes a Trial of one whose robot gave up."""
+    waiting = iter(jobs)
+    running: dict[int, Lane] = {}
+    while True:
+        for number in range(lanes):
+            if number not in running and (job := next(waiting, None)) is not None:
+                running[number] = Lane(job, *start(job, number))
+        if not running:
+            return
+        requests: dict[int, PlanRequest] = {}
+        for number, lane in list(running.items()):
+            try:
+                outcome = lane.step()
+            except RobotError as error:
+                outcome = failed(lane, error)
+            if isinstance(outcome, PlanRequest):
+                requests[number] = outcome
+            else:
+                del running[number]
+                yield lane.job, outcome
+        for number, chunk in plan_together(requests).items():
+            running[number].answer = chunk
 
 
 class FinishedAdaptation:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,15 +20,28 @@ NoiseKey = tuple[int, int, int]
 
 def plan_one(request: PlanRequest) -> ActionChunk:
     """The chunk of one request, with the noise its key names."""
-    spec = request.policy.spec
-    noise = keyed_noise(request.noise_key, spec.horizon, spec.action_dim)
-    (chunk,) = request.policy.plan([request.history], [request.tick], noise[None])
-    if not np.all(np.isfinite(chunk.actions)):
-        raise PolicyError(
-            f"policy {chunk.policy_version} planned a non-finite action at tick {request.tick} of attempt "
-            f"{request.noise_key[1]}; check its training or go back to another checkpoint"
-        )
-    return chunk
+    return plan_together({0: request})[0]
+
+
+def plan_together(requests: Mapping[int, PlanRequest]) -> dict[int, ActionChunk]:
+    """The chunk of every request, those of one policy in one batch. Raises PolicyError on a non-finite action."""
+    batches: dict[int, list[int]] = {}
+    for name, request in requests.items():
+        batches.setdefault(id(request.policy), []).append(name)
+    chunks: dict[int, ActionChunk] = {}
+    for names in batches.values():
+        some = [requests[name] for name in names]
+        policy, spec = some[0].policy, some[0].policy.spec
+        noise = np.stack([keyed_noise(r.noise_key, spec.horizon, spec.action_dim) for r in some])
+        planned = policy.plan([r.history for r in some], [r.tick for r in some], noise)
+        for name, request, chunk in zip(names, some, planned, strict=True):
+            if not np.all(np.isfinite(chunk.actions)):
+                raise PolicyError(
+                    f"policy {chunk.policy_version} planned a non-finite action at tick {request.tick} of attempt "
+                    f"{request.noise_key[1]}; check its training or go back to another checkpoint"
+                )
+            chunks[name] = chunk
+    return chunks
 
 
 class LockstepPlanner:

@@ -158,7 +158,7 @@ def plant() -> TwinPlant:
 
 @pytest.fixture(scope="session")
 def lockstep(plant: TwinPlant) -> Iterator[LockstepBench]:
-    view = TwinView(plant.model_xml(), plant.base_pose())
+    view = TwinView(plant.model_xml(), plant.base_pose(), plant.cameras())
     yield LockstepBench(LockstepRobot(plant, view, RIG, TASK))
     view.close()
 

@@ -10,7 +10,8 @@ from far_app.types import Pose
 from hw.lockstep import LockstepRobot
 from hw.rig import load_rig
 from hw.twin import SERVO_HZ, TwinPlant
-from hw.twin_view import CAMERAS, TwinView, look_at
+from hw.twin_arms import ARMS
+from hw.twin_view import FRONT, TwinView, look_at
 
 RIG, TASK = load_rig("twin"), task("lift")
 
@@ -22,7 +23,7 @@ def plant() -> TwinPlant:
 
 @pytest.fixture(scope="module")
 def view(plant: TwinPlant):
-    view = TwinView(plant.model_xml(), plant.base_pose())
+    view = TwinView(plant.model_xml(), plant.base_pose(), plant.cameras())
     yield view
     view.close()
 
@@ -130,7 +131,7 @@ def test_geometry_belongs_to_bodies_that_have_poses(plant, view):
 def test_cameras_look_at_their_targets():
     import mujoco
 
-    for camera in CAMERAS.values():
+    for camera in (FRONT, *(arm.wrist for arm in ARMS.values())):
         matrix = np.empty(9)
         mujoco.mju_quat2Mat(matrix, look_at(camera))
         forward = -matrix.reshape(3, 3)[:, 2]

@@ -74,7 +74,7 @@ def test_non_finite_plans_are_refused():
 
 
 def test_quaternions_of_either_sign_mean_the_same():
-    normalizer = Normalizer()
+    normalizer = Normalizer(8)
     states = np.random.default_rng(0).normal(size=(50, 8)).astype(np.float32)
     normalizer.fit(states)
     flipped = states.copy()
