@@ -13,7 +13,7 @@ import json
 import multiprocessing
 import queue
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -88,32 +88,36 @@ def identity(path: str) -> str:
     return f"{file.name} sha256:{hashlib.sha256(file.read_bytes()).hexdigest()[:16]}" if file.is_file() else path
 
 
-def read_arms(path: Path) -> tuple[Arm, ...]:
-    """The columns of a comparison from a TOML file, each with a name, a method and what differs from its defaults:
+def read_arms_file(path: Path) -> tuple[Arm, ...]:
+    """The columns of a comparison from a TOML file of [[arm]] tables."""
+    if not path.exists():
+        raise ConfigError(f"no file of arms at {path}; give one, or --methods")
+    try:
+        return read_arms(tomllib.loads(path.read_text()), path.name)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path} is not valid TOML: {error}") from error
+
+
+def read_arms(table: Mapping[str, Any], source: str) -> tuple[Arm, ...]:
+    """The columns of a comparison, each with a name, a method and what differs from its defaults:
 
     [[arm]]
     name = "far, smaller steps"
     method = "far"
     retry.fcpa = { lr = 2e-6, guard = "scale" }
     """
-    if not path.exists():
-        raise ConfigError(f"no file of arms at {path}; give one, or --methods")
-    try:
-        table = tomllib.loads(path.read_text())
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}") from error
     entries = table.get("arm")
     if set(table) != {"arm"} or not isinstance(entries, list) or not entries:
-        raise ConfigError(f"{path} has the tables {', '.join(table) or '(none)'}; it must list [[arm]] tables alone")
+        raise ConfigError(f"{source} has the tables {', '.join(table) or '(none)'}; it must list [[arm]] tables alone")
     arms = []
     for number, entry in enumerate(entries, 1):
-        where = f"{path.name}: arm {number}"
+        where = f"{source}: arm {number}"
         missing = {"name", "method"} - set(entry)
         if missing:
             raise ConfigError(f"{where} has no {', '.join(sorted(missing))}")
         arms.append(from_table(Arm, entry, where))
     if len({a.name for a in arms}) < len(arms):
-        raise ConfigError(f"{path} names an arm twice; every arm needs a name of its own")
+        raise ConfigError(f"{source} names an arm twice; every arm needs a name of its own")
     return tuple(arms)
 
 

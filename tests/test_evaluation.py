@@ -7,7 +7,7 @@ import pytest
 
 from far_app.config import FCPAConfig, RetryConfig
 from far_app.errors import ConfigError
-from far_app.evaluation import Arm, EvaluationPlan, differences, evaluate, read_arms, read_results, run_block
+from far_app.evaluation import Arm, EvaluationPlan, differences, evaluate, read_arms_file, read_results, run_block
 from far_app.types import Attempt, Judge, Outcome, Trial
 
 PLAN = EvaluationPlan(
@@ -73,7 +73,7 @@ def written(folder, text):
 
 
 def test_arms_from_a_file_differ_only_where_it_says(tmp_path):
-    plain, small = read_arms(written(tmp_path, """
+    plain, small = read_arms_file(written(tmp_path, """
 [[arm]]
 name = "nr"
 method = "nr"
@@ -103,7 +103,7 @@ retry.perturbation.dims = [0, 1, 2]
 )
 def test_a_wrong_file_of_arms_is_named(tmp_path, text, says):
     with pytest.raises(ConfigError, match=says):
-        read_arms(written(tmp_path, text))
+        read_arms_file(written(tmp_path, text))
 
 
 def test_results_go_on_wherever_the_checkpoints_lie_but_not_with_others(tmp_path):

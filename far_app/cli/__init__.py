@@ -15,6 +15,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "train policy": ("far_app.cli.train_policy", "train the diffusion policy on demonstrations"),
     "train critic": ("far_app.cli.train_critic", "train the IQL critic on demonstrations"),
     "eval": ("far_app.cli.evaluate", "compare ways to retry, in lockstep, over many scenes"),
+    "study": ("far_app.cli.study", "tasks × training seeds × methods from one file: models, episodes, tables"),
     "inspect": ("far_app.cli.inspect", "what a recorded session holds, and what is missing or damaged"),
     "replay": ("far_app.cli.replay", "open a recorded attempt or session in the rerun viewer"),
     "bench loop": ("far_app.bench.loop", "lateness of the 30 Hz loop, idle and adapting"),

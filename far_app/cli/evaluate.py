@@ -23,7 +23,7 @@ from far_app.evaluation import (
     Block,
     EvaluationPlan,
     evaluate,
-    read_arms,
+    read_arms_file,
     read_results,
     run_block,
 )
@@ -71,7 +71,7 @@ def main(arguments: Sequence[str]) -> int:
     first = kind if options.first_scene is None else options.first_scene
     plan = EvaluationPlan(
         task=task.name, rig=options.rig, policy=str(policy), critic=str(critic),
-        arms=read_arms(options.arms)
+        arms=read_arms_file(options.arms)
         if options.arms
         else tuple(Arm(name=m, method=m, retry=options.retry) for m in options.methods),
         first_scene=first, scenes=options.scenes,

@@ -116,7 +116,8 @@ class ActingPolicy:
 
     def _encode_new(self, observations: Sequence[Observation]) -> None:
         unseen = list({id(o): o for o in observations if id(o) not in self._kept}.values())
-        for new in [unseen] if self.batch is None else [[o] for o in unseen]:
+        size = max(1, len(unseen)) if self.batch is None else 1
+        for new in (unseen[i : i + size] for i in range(0, len(unseen), size)):
             per_camera = [
                 self.network.encoder.camera_features(
                     c, 0, torch.from_numpy(np.stack([o.images[c] for o in new])).to(self.device)

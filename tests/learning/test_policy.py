@@ -65,6 +65,13 @@ def test_a_batch_of_histories_gives_what_each_gives_alone():
         assert np.allclose(alone.actions, together[i].actions, atol=1e-4)
 
 
+def test_the_same_observation_twice_gives_the_same_chunk():
+    acting, seen = ActingPolicy(small_policy(), "v"), observations(2)
+    noise = np.zeros((1, 8, 7), np.float32)
+    first, again = (acting.plan([(seen[0], seen[1])], [0], noise)[0].actions for _ in range(2))
+    assert np.array_equal(first, again)
+
+
 def test_non_finite_plans_are_refused():
     policy = small_policy()
     next(iter(policy.denoiser.parameters())).data.fill_(float("nan"))

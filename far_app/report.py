@@ -1,0 +1,137 @@
+"""What a study found, as Markdown: success by attempt, paired differences from the same scenes, tests, costs.
+
+Per task: success over its training seeds (mean ± standard deviation), Wilson's 95 % interval over episodes, the exact
+McNemar p against naive retry. Over tasks: the mean difference, with an interval from resampled (task, training seed)
+clusters, because episodes of one model are not independent of each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from far_app.statistics import costs, mcnemar, paired_difference, solved_within, wilson
+
+RESAMPLES = 10_000
+BASELINE = "nr"
+
+Cluster = tuple[str, int]
+"""A task and a training seed."""
+Records = Sequence[Mapping[str, Any]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyResults:
+    arms: tuple[str, ...]
+    max_attempts: int
+    records: Mapping[Cluster, Records]
+
+    @property
+    def tasks(self) -> list[str]:
+        return list(dict.fromkeys(task for task, _ in self.records))
+
+    def solved(self, cluster: Cluster, arm: str, attempts: int) -> dict[int, bool]:
+        """By scene, of those that every arm has run."""
+        by_arm = {a: {r["scene"]: r for r in self.records[cluster] if r["arm"] == a} for a in self.arms}
+        scenes = sorted(set.intersection(*(set(found) for found in by_arm.values())))
+        return {s: solved_within(dict(by_arm[arm][s]), attempts) for s in scenes}
+
+    def clusters(self, task: str) -> list[Cluster]:
+        return [c for c in self.records if c[0] == task and self.solved(c, self.arms[0], 1)]
+
+
+def markdown(results: StudyResults) -> str:
+    parts = [task_section(results, task) for task in results.tasks if results.clusters(task)]
+    if len(parts) > 1:
+        parts.append(pooled_section(results))
+    return "\n\n".join(["# Results", *parts]) + "\n"
+
+
+def task_section(results: StudyResults, task: str) -> str:
+    """One task's tables."""
+    clusters, last = results.clusters(task), results.max_attempts
+    episodes = sum(len(results.solved(c, results.arms[0], 1)) for c in clusters)
+    lines = [
+        f"## {task}", "",
+        f"{episodes} episodes of {len(clusters)} training seed{'s' * (len(clusters) > 1)}, up to {last} attempts.", "",
+        "| method | attempt 1 | " + " | ".join(f"within {k}" for k in range(2, last + 1))
+        + f" | mean ± std over seeds | − {BASELINE}, points | McNemar p |",
+        "|---" * (last + 4) + "|",
+    ]  # fmt: skip
+    for arm in results.arms:
+        cells = [arm]
+        for attempts in range(1, last + 1):
+            solved = together(results, clusters, arm, attempts)
+            cells.append(rate(solved) if attempts in (1, last) else f"{100 * np.mean(solved):.1f}")
+        by_seed = [100 * float(np.mean(list(results.solved(c, arm, last).values()))) for c in clusters]
+        spread = f" ± {np.std(by_seed, ddof=1):.1f}" if len(by_seed) > 1 else ""
+        cells.append(f"{np.mean(by_seed):.1f}{spread}")
+        cells += ["", ""] if arm == BASELINE or BASELINE not in results.arms else against(results, clusters, arm)
+        lines.append("| " + " | ".join(cells) + " |")
+    lines += [
+        "",
+        "| cost | attempts an episode | ticks | adaptations | seconds an adaptation |",
+        "|---|---|---|---|---|",
+    ]
+    for arm in results.arms:
+        records = [dict(r) for c in clusters for r in results.records[c] if r["arm"] == arm]
+        lines.append(f"| {arm} | {' | '.join(costs(records))} |")
+    return "\n".join(lines)
+
+
+def pooled_section(results: StudyResults) -> str:
+    """The mean over tasks, and its differences with intervals from resampled clusters."""
+    lines = [
+        "## over tasks", "",
+        f"Success within {results.max_attempts}, mean over tasks; differences in points with 95 % intervals from "
+        f"{RESAMPLES:,} resamples of (task, training seed) clusters.", "",
+        f"| method | success | − {BASELINE} | − first attempt (dp) |", "|---|---|---|---|",
+    ]  # fmt: skip
+    for arm in results.arms:
+        mean = np.mean([np.mean(together(results, results.clusters(t), arm, results.max_attempts))
+                        for t in results.tasks if results.clusters(t)])  # fmt: skip
+        versus = "" if arm == BASELINE or BASELINE not in results.arms else pooled(results, arm, BASELINE)
+        lines.append(f"| {arm} | {100 * mean:.1f} | {versus} | {pooled(results, arm, None)} |")
+    return "\n".join(lines)
+
+
+def together(results: StudyResults, clusters: Sequence[Cluster], arm: str, attempts: int) -> list[bool]:
+    return [solved for c in clusters for solved in results.solved(c, arm, attempts).values()]
+
+
+def rate(solved: Sequence[bool]) -> str:
+    low, high = wilson(sum(solved), len(solved))
+    return f"{100 * np.mean(solved):.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def against(results: StudyResults, clusters: Sequence[Cluster], arm: str) -> list[str]:
+    """Paired difference to the baseline, and its exact p."""
+    ours, theirs = (together(results, clusters, a, results.max_attempts) for a in (arm, BASELINE))
+    mean, low, high = paired_difference(ours, theirs)
+    p = mcnemar(
+        sum(a and not b for a, b in zip(ours, theirs, strict=True)),
+        sum(b and not a for a, b in zip(ours, theirs, strict=True)),
+    )
+    return [f"{100 * mean:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]", f"{p:.3g}"]
+
+
+def pooled(results: StudyResults, arm: str, baseline: str | None) -> str:
+    """Mean over tasks of the paired difference to a baseline, or to the first attempt; clusters are resampled within
+    their tasks."""
+    by_task = []
+    for task in results.tasks:
+        means = []
+        for cluster in results.clusters(task):
+            ours = results.solved(cluster, arm, results.max_attempts)
+            theirs = results.solved(cluster, baseline or arm, results.max_attempts if baseline else 1)
+            means.append(np.mean([float(ours[s]) - float(theirs[s]) for s in ours]))
+        if means:
+            by_task.append(np.array(means))
+    rng = np.random.default_rng(0)
+    draws = np.mean([m[rng.integers(0, len(m), (RESAMPLES, len(m)))].mean(1) for m in by_task], axis=0)
+    low, high = np.percentile(draws, (2.5, 97.5))
+    mean = np.mean([m.mean() for m in by_task])
+    return f"{100 * mean:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"

@@ -1,0 +1,125 @@
+"""A study says which commands make its models and which scenes judge them; its report counts what is there."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from far_app.errors import ConfigError
+from far_app.evaluation import REPORT_SCENES
+from far_app.report import StudyResults, markdown, pooled
+from far_app.study import demonstrating, model_folder, read_study, training
+
+TEXT = """
+rig = "panda"
+preset = "state"
+seeds = [0, 2]
+scenes = 10
+max_attempts = 3
+[[task]]
+name = "lift"
+demonstrations = 20
+iterations = 100
+[[arm]]
+name = "nr"
+method = "nr"
+[[arm]]
+name = "far, small steps"
+method = "far"
+retry.fcpa = { lr = 2e-6 }
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "study.toml"
+    path.write_text(text)
+    return path
+
+
+def test_every_seed_has_its_own_model_and_its_own_scenes(tmp_path):
+    study = read_study(written(tmp_path, TEXT))
+    (task,) = study.tasks
+    plans = [study.plan(tmp_path, task, seed) for _, seed in study.models]
+    scenes = [range(p.first_scene, p.first_scene + p.scenes) for p in plans]
+    assert [s.start for s in scenes] == [REPORT_SCENES, REPORT_SCENES + 20]
+    assert not set(scenes[0]) & set(scenes[1])
+    assert len({p.policy for p in plans}) == 2
+    assert [a.name for a in plans[0].arms] == ["nr", "far, small steps"]
+
+
+def test_the_commands_are_the_documented_ones(tmp_path):
+    study = read_study(written(tmp_path, TEXT))
+    (task,) = study.tasks
+    assert demonstrating(study, tmp_path, task)[:3] == ["demo", "--task", "lift"]
+    policy, attempts, critic = training(study, tmp_path, task, 2)
+    assert policy[:2] == ["train", "policy"] and critic[:2] == ["train", "critic"] and attempts[0] == "demo"
+    assert "--no-images" in attempts
+    assert str(model_folder(tmp_path, task, 2) / "policy.safetensors") in critic
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("seeds = [0, 2]", ""), "does not say seeds"),
+        (('name = "lift"', 'name = "juggle"'), "unknown task 'juggle'; choose one of: bread"),
+        (("scenes = 10", "scenes = 10\nspeed = 2"), "unknown setting speed"),
+        (("iterations = 100", "iterations = 100\nlr = 1"), "task 1: unknown setting lr"),
+        (('method = "nr"', ""), "arm 1 has no method"),
+        (("rig =", "rig"), "not valid TOML"),
+    ],
+)
+def test_a_wrong_study_is_named(tmp_path, change, says):
+    with pytest.raises(ConfigError, match=says):
+        read_study(written(tmp_path, TEXT.replace(*change, 1)))
+
+
+def episode(arm: str, scene: int, attempts: int, success: bool) -> dict:
+    return {"arm": arm, "scene": scene, "attempts": attempts, "success": success, "ticks": [10] * attempts,
+            "adaptations": []}  # fmt: skip
+
+
+def results() -> StudyResults:
+    """Two tasks, two seeds, ten scenes each: nr solves half at once, far all at the second attempt."""
+    records = {}
+    for task in ("lift", "can"):
+        for seed in (0, 1):
+            easy = [s < 5 for s in range(10)]
+            records[task, seed] = [
+                *(episode("nr", s, 1 if e else 2, e) for s, e in enumerate(easy)),
+                *(episode("far", s, 1 if e else 2, True) for s, e in enumerate(easy)),
+            ]
+    return StudyResults(arms=("nr", "far"), max_attempts=2, records=records)
+
+
+def test_the_report_counts_episodes_seeds_and_pairs():
+    text = markdown(results())
+    assert "20 episodes of 2 training seeds, up to 2 attempts" in text
+    assert "| nr | 50.0 [29.9, 70.1] | 50.0 [29.9, 70.1] | 50.0 ± 0.0 |" in text
+    row = next(line for line in text.splitlines() if line.startswith("| far | 50.0"))
+    assert "100.0 [83.9, 100.0]" in row and "+50.0" in row and "0.00195" in row
+    assert pooled(results(), "far", "nr") == "+50.0 [+50.0, +50.0]"
+    assert "## over tasks" in text
+
+
+def test_a_scene_that_an_arm_has_not_run_counts_for_none():
+    whole = results()
+    torn = dict(whole.records)
+    torn["lift", 0] = [r for r in torn["lift", 0] if not (r["arm"] == "far" and r["scene"] == 9)]
+    part = StudyResults(arms=whole.arms, max_attempts=2, records=torn)
+    assert len(part.solved(("lift", 0), "nr", 2)) == 9
+    assert "19 episodes" in markdown(part)
+
+
+def test_clusters_not_episodes_are_resampled():
+    rng = np.random.default_rng(0)
+    records = {}
+    for seed, gain in enumerate((0.0, 0.5, 1.0)):
+        nr = rng.random(200) < 0.2
+        far = nr | (rng.random(200) < gain)
+        records["lift", seed] = [
+            *(episode("nr", s, 2, bool(x)) for s, x in enumerate(nr)),
+            *(episode("far", s, 2, bool(x)) for s, x in enumerate(far)),
+        ]
+    text = pooled(StudyResults(arms=("nr", "far"), max_attempts=2, records=records), "far", "nr")
+    low, high = (float(x) for x in text.split("[")[1].rstrip("]").split(","))
+    assert high - low > 40, "seeds that differ so much leave the difference wide open, however many their episodes"
