@@ -28,7 +28,7 @@ PROMPT_NICENESS = -10
 """Of threads beside a real-time one, and of those where real time is not permitted."""
 DRAWING_NICENESS = -5
 """Of the GL driver's worker threads: before anything on the machine that did not ask, after the loop."""
-BACKGROUND_NICENESS = 0
+BACKGROUND_NICENESS = -5
 """Of learning: after all that drives the arm, but no lower, for between its operations it holds the interpreter."""
 
 SWITCH_INTERVAL = 1e-4

@@ -66,7 +66,7 @@ class PolicyTraining:
 
 TRAININGS = {
     "paper": PolicyTraining(),
-    "state": PolicyTraining(iterations=6_000, batch=128, draws=2, lr=5e-4, lr_end=2e-5, shift=0),
+    "state": PolicyTraining(iterations=3_000, batch=64, draws=2, lr=5e-4, lr_end=2e-5, shift=0),
     "quickstart": PolicyTraining(iterations=2_000, batch=64, draws=2, lr=5e-4, lr_end=2e-5),
 }
 
