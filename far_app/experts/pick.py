@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,39 +14,49 @@ SLIPPED = 0.06
 """Metres between hand and grasp from which the object is no longer in the hand."""
 
 
+@dataclass
+class Held:
+    """How the object was taken. Once it is in the hand it turns with the hand, and says no more of how to turn it."""
+
+    height: float = 0.0
+    """Of the grasp where it lay, metres."""
+    yaw: float = 0.0
+    """Of the hand, radians."""
+
+
 def pick(
     hand: Hand, start: Pose, grasp: Callable[[Observation], np.ndarray], yaw: Callable[[Observation], float],
-    height: float,
+    height: float, held: Held, top: float = 0.0,
 ) -> list[Phase]:  # fmt: skip
-    """Phases until the object hangs `height` above where it lay; `grasp` and `yaw` say where and how to take it."""
+    """Phases until the object hangs `height` above where it lay; `grasp` and `yaw` say where and how to take it, `top`
+    how far the object reaches above the grasp (metres)."""
     style = hand.style
-    lay = [0.0]
 
     def at(observation: Observation, up: float) -> Pose:
         position = grasp(observation) + style.offset + (0.0, 0.0, up)
         return Pose(position=position, quaternion=turned(start, yaw(observation)))
 
     def over(observation: Observation) -> Pose:
-        goal = at(observation, style.hover)
+        goal = at(observation, top + style.hover)
         distance = float(np.linalg.norm((goal.position - observation.eef.position)[:2]))
         detour = np.append(style.via * min(1.0, max(0.0, distance - 0.02) / 0.10), 0.0)
         return Pose(position=goal.position + detour, quaternion=goal.quaternion)
 
     def down(observation: Observation) -> Pose:
-        lay[0] = float(grasp(observation)[2])
+        held.height, held.yaw = float(grasp(observation)[2]), yaw(observation)
         return at(observation, 0.0)
 
     def up(observation: Observation) -> Pose:
         position = observation.eef.position.copy()
-        position[2] = lay[0] + height
-        return Pose(position=position, quaternion=turned(start, yaw(observation)))
+        position[2] = held.height + height
+        return Pose(position=position, quaternion=turned(start, held.yaw))
 
     def strayed(observation: Observation) -> bool:
         return bool(np.linalg.norm((grasp(observation) + style.offset - observation.eef.position)[:2]) > 0.03)
 
     return [
         Phase(goal=over, gripper=-1.0, near=0.012),
-        Phase(goal=down, gripper=-1.0, near=0.008, lost=strayed),
+        Phase(goal=down, gripper=-1.0, near=0.008, patience=2.0, lost=strayed),
         Phase(goal=down, gripper=1.0, near=0.02, turn=0.3, dwell=style.dwell, patience=1.0),
         Phase(goal=up, gripper=1.0, near=0.02, turn=0.5, lost=slipped(grasp)),
     ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from far_app.experts.pick import carried, pick, slipped
+from far_app.experts.pick import Held, carried, pick, slipped
 from far_app.experts.script import Hand, Phase, Script, Steady, folded, turned, yaw_of
 from far_app.types import Observation, Pose
 
@@ -45,7 +45,7 @@ def square(hand: Hand, start: Pose) -> Script:
 
     lost = slipped(handle)
     return Script(hand, [
-        *pick(hand, start, handle, across, height=ABOVE),
+        *pick(hand, start, handle, across, height=ABOVE, held=Held()),
         Phase(goal=to_peg(ABOVE), gripper=1.0, near=0.005, turn=0.05, patience=4.0, lost=lost),
         Phase(goal=to_peg(SEATED), gripper=1.0, near=0.01, turn=0.2, patience=2.0, lost=lost),
         Phase(goal=lambda o: Pose(position=o.eef.position, quaternion=o.eef.quaternion), gripper=-1.0, dwell=0.5),
