@@ -69,6 +69,7 @@ def make_environment(task: TaskConfig, robot: str) -> Any:
     return robosuite.make(
         task.environment, robots=robot, has_renderer=False, has_offscreen_renderer=False, use_camera_obs=False,
         reward_shaping=True, initialization_noise=None, hard_reset=False, horizon=10**9, control_freq=SERVO_HZ,
+        seed=0,  # Lift draws its cube's size when it is made: every twin of a task must be the same
         **chosen,
     )  # fmt: skip
 

@@ -48,6 +48,14 @@ def test_scenes_come_from_seeds_and_spread_wide(plant):
     assert np.ptp(yaws) > 1.5
 
 
+def test_two_twins_of_a_task_are_the_same(plant):
+    other = TwinPlant(RIG, TASK)
+    assert np.array_equal(other.model.geom_size, plant.model.geom_size)
+    for one in (plant, other):
+        one.reset(7)
+    assert np.array_equal(other.data.qpos, plant.data.qpos)
+
+
 def test_the_arm_starts_at_the_rig_s_start_pose(plant):
     plant.reset(0)
     eef = plant.measure().eef
