@@ -15,12 +15,13 @@ import queue
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from far_app.config import RetryConfig, from_table
-from far_app.errors import ConfigError
+from far_app.errors import ConfigError, FarError
 from far_app.types import Trial
 
 Job = tuple[int, dict[str, dict[str, Any]]]
@@ -229,7 +230,13 @@ def _records(
                     yield told.get(timeout=0.2)
                     heard += 1
             done, pending = wait(pending, timeout=0)
-            expected += sum(future.result() for future in done)  # raises a worker's error, and that one was killed
+            try:
+                expected += sum(future.result() for future in done)
+            except BrokenProcessPool as error:
+                raise FarError("a worker was killed; every finished episode is kept: start again to go on") from error
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
 
 
 _TELL: dict[str, Any] = {}

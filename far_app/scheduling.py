@@ -52,7 +52,7 @@ def real_time(priority: int, niceness: int = PROMPT_NICENESS) -> str:
     processes that it starts begin at the usual priority."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_TIMERSLACK, _TIMER_SLACK_NS, 0, 0, 0)
-    if _schedule(priority, os.SCHED_RESET_ON_FORK):
+    if _schedule(priority, inherited=False):
         return "fifo"
     return "nice" if nice(niceness) else "normal"
 
@@ -76,7 +76,7 @@ def prompt_context() -> zmq.Context[zmq.Socket[bytes]]:
 
     def make() -> None:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
-        _schedule(MESSAGE_PRIORITY)
+        _schedule(MESSAGE_PRIORITY, inherited=True)
         context.socket(zmq.PAIR).close()  # the first socket starts the context's thread, which inherits the priority
         made.append(context)
 
@@ -86,9 +86,11 @@ def prompt_context() -> zmq.Context[zmq.Socket[bytes]]:
     return made[0]
 
 
-def _schedule(priority: int, flags: int = 0) -> bool:
+def _schedule(priority: int, inherited: bool) -> bool:
+    """Real time for the calling thread, and for the threads it starts or not; False where not permitted."""
     try:
-        os.sched_setscheduler(threading.get_native_id(), os.SCHED_FIFO | flags, os.sched_param(priority))
+        policy = os.SCHED_FIFO | (0 if inherited else os.SCHED_RESET_ON_FORK)
+        os.sched_setscheduler(threading.get_native_id(), policy, os.sched_param(priority))
     except (OSError, AttributeError):
         return False
     return True

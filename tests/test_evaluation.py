@@ -2,11 +2,14 @@
 
 import dataclasses
 import json
+import os
+import signal
+import time
 
 import pytest
 
 from far_app.config import FCPAConfig, RetryConfig
-from far_app.errors import ConfigError
+from far_app.errors import ConfigError, FarError
 from far_app.evaluation import Arm, EvaluationPlan, differences, evaluate, read_arms_file, read_results, run_block
 from far_app.types import Attempt, Judge, Outcome, Trial
 
@@ -41,6 +44,24 @@ def test_a_second_start_does_only_what_is_missing(tmp_path):
     assert WORKED == [102]
     found = {(r["scene"], r["arm"]) for r in read_results(tmp_path / "episodes.jsonl")}
     assert found == {(s, a) for s in (100, 101, 102) for a in ("nr", "far")}
+
+
+def killed_in_scene_101(block):
+    for record in work(block):
+        if record["scene"] == 101:
+            time.sleep(1.0)  # what was told before is on its way
+            os.kill(os.getpid(), signal.SIGKILL)
+        yield record
+
+
+@pytest.mark.slow
+def test_two_workers_find_the_same_and_a_killed_one_costs_no_finished_episode(tmp_path):
+    with pytest.raises(FarError, match="a worker was killed; every finished episode is kept"):
+        evaluate(tmp_path, PLAN, 2, lambda record: None, begin, killed_in_scene_101)
+    assert {r["scene"] for r in read_results(tmp_path / "episodes.jsonl")} >= {100}
+    evaluate(tmp_path, PLAN, 2, lambda record: None, begin, work)
+    found = sorted((r["scene"], r["arm"]) for r in read_results(tmp_path / "episodes.jsonl"))
+    assert found == sorted((s, a) for s in (100, 101, 102) for a in ("nr", "far")), "nothing lost, nothing twice"
 
 
 def test_results_of_another_plan_are_refused(tmp_path):

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from far_app.cli.lockstep_twin import lockstep_twin
 from far_app.config import TaskConfig
 from far_app.demonstrations import SEED_OFFSET, demonstrate
-from far_app.learning.dataset import count_episodes, episode_of, last_scene, write_episode
+from far_app.learning.dataset import check_origin, count_episodes, episode_of, last_scene, write_episode
 from far_app.tasks import task as find_task
 from far_app.types import Observation
 from hw.lockstep import LockstepRobot
@@ -57,6 +57,7 @@ def main(arguments: Sequence[str]) -> int:
         "env_name": task.environment, "type": 1,
         "env_kwargs": {"robots": robot.rig.arm, "rig": dataclasses.asdict(robot.rig)},
     }  # fmt: skip
+    check_origin(path, env_args)
     attempt = policy_attempt(options.policy, task, robot, options.explore) if options.policy is not None else None
     scene = SEED_OFFSET + options.seed + last_scene(path)
     failures = 0

@@ -31,14 +31,14 @@ class StudyOptions:
     study: tyro.conf.Positional[Path]
     """The study, a TOML file."""
     out: Path | None = None
-    """Folder of the models and results; beside the study, by its name, by default."""
+    """Folder of the models and results; runs/ and the study's name by default."""
     workers: int = 2
 
 
 def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(StudyOptions, args=list(arguments), prog="far study")
     study = read_study(options.study)
-    folder = options.out or options.study.with_suffix("")
+    folder = options.out or Path("runs") / options.study.stem
     make_models(study, folder, options.workers)
     for task, seed in study.models:
         print(f"{task.name}, training seed {seed}", flush=True)

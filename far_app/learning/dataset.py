@@ -12,12 +12,13 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from far_app.errors import RecordingError
+from far_app.errors import ConfigError, RecordingError
 from far_app.types import Observation
 
 
@@ -69,6 +70,24 @@ def count_episodes(path: Path) -> int:
         return 0
     with h5py.File(path, "r") as file:
         return len(file["data"]) if "data" in file else 0
+
+
+def check_origin(path: Path, env_args: dict[str, object]) -> None:
+    """ConfigError when a file holds episodes of another environment or another arm."""
+    if not path.exists():
+        return
+    with h5py.File(path, "r") as file:
+        raw = file["data"].attrs.get("env_args") if "data" in file else None
+    there = json.loads(raw) if raw else env_args
+
+    def origin(args: dict[str, Any]) -> tuple[str, str]:
+        return str(args.get("env_name")), str(args.get("env_kwargs", {}).get("robots")).lower()
+
+    if origin(there) != origin(env_args):
+        raise ConfigError(
+            f"{path} holds episodes of {' on '.join(origin(there))}, these would be of "
+            f"{' on '.join(origin(env_args))}; give another --out"
+        )
 
 
 def last_scene(path: Path) -> int:

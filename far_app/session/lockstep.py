@@ -11,33 +11,16 @@ from dataclasses import dataclass, field
 from far_app.errors import RobotError
 from far_app.protocols import Method, PlanRequest
 from far_app.session.planners import plan_one, plan_together
-from far_app.trial import Adapted, AttemptEnded, Event, RunningAdaptation, Tick, TrialEvents
+from far_app.trial import Adapted, AttemptEnded, RunningAdaptation, Tick, TrialEvents
 from far_app.types import ActionChunk, Adaptation, Attempt, Trial
 
 Advance = Callable[[], float]
 """Lets one tick of a robot's time pass and returns the new time, seconds."""
 
 
-def run_lockstep(events: TrialEvents, advance: Advance, listen: Callable[[Event], None] = lambda event: None) -> Trial:
-    """Drive one trial to its end."""
-    answer = None
-    while True:
-        try:
-            event = events.send(answer)
-        except StopIteration as end:
-            return end.value
-        listen(event)
-        if isinstance(event, Tick):
-            answer = advance()
-        elif isinstance(event, PlanRequest):
-            answer = plan_one(event)
-        else:
-            answer = None
-
-
 @dataclass
 class Lane:
-    """A trial that is under way beside others."""
+    """A trial that is under way, alone or beside others."""
 
     job: int
     events: TrialEvents
@@ -62,6 +45,14 @@ class Lane:
                 self.attempts.append(event.attempt)
             elif isinstance(event, Adapted):
                 self.adaptations.append(event.adaptation)
+
+
+def run_lockstep(events: TrialEvents, advance: Advance) -> Trial:
+    """Drive one trial to its end."""
+    lane = Lane(0, events, advance)
+    while isinstance(outcome := lane.step(), PlanRequest):
+        lane.answer = plan_one(outcome)
+    return outcome
 
 
 Start = Callable[[int, int], tuple[TrialEvents, Advance]]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from far_app.errors import ConfigError, RecordingError
-from far_app.learning.dataset import Episode, read_episodes, write_episode
+from far_app.learning.dataset import Episode, check_origin, read_episodes, write_episode
 from far_app.learning.policy import fingerprint, load_policy, preset
 from far_app.learning.segments import DemonstrationArrays
 from far_app.learning.train_policy import PolicyTraining, learning_rate, train_policy
@@ -27,6 +27,18 @@ def episodes(count: int = 3, length: int = 12, size: int = 16) -> list[Episode]:
         )
         for i in range(count)
     ]  # fmt: skip
+
+
+def test_episodes_of_two_arms_are_never_mixed(tmp_path):
+    def origin(robots: str) -> dict[str, object]:
+        return {"env_name": "Lift", "type": 1, "env_kwargs": {"robots": robots}}
+
+    path = tmp_path / "d.hdf5"
+    check_origin(path, origin("panda"))
+    write_episode(path, episodes(1)[0], np.zeros((12, 7)), origin("XArm7"))
+    check_origin(path, origin("xarm7"))
+    with pytest.raises(ConfigError, match="episodes of Lift on xarm7, these would be of Lift on panda"):
+        check_origin(path, origin("panda"))
 
 
 def test_segments_never_cross_an_episode_and_chunks_repeat_the_last_action():
