@@ -6,8 +6,9 @@ With --policy it records a policy's own attempts instead, whatever their outcome
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,16 +16,21 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from far_app.cli.lockstep_twin import lockstep_twin
+from far_app.cli.lockstep_twin import lockstep_twins
 from far_app.config import TaskConfig
 from far_app.demonstrations import SEED_OFFSET, demonstrate
+from far_app.errors import RobotError
 from far_app.learning.dataset import check_origin, count_episodes, episode_of, last_scene, write_episode
+from far_app.protocols import Resume
 from far_app.tasks import task as find_task
-from far_app.types import Observation
+from far_app.types import Observation, Trial
 from hw.lockstep import LockstepRobot
 from hw.rig import load_rig
 
 log = logging.getLogger(__name__)
+
+LANES = 8
+"""A policy's attempts side by side."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,65 +56,83 @@ class DemoOptions:
 
 def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(DemoOptions, args=list(arguments), prog="far demo")
-    task = find_task(options.task, load_rig(options.rig).arm)
-    robot = lockstep_twin(options.rig, task, options.images)
+    rig = load_rig(options.rig)
+    task = find_task(options.task, rig.arm)
     path = options.out or Path("datasets") / f"{task.name}.hdf5"
     env_args = {
-        "env_name": task.environment, "type": 1,
-        "env_kwargs": {"robots": robot.rig.arm, "rig": dataclasses.asdict(robot.rig)},
+        "env_name": task.environment, "type": 1, "env_kwargs": {"robots": rig.arm, "rig": dataclasses.asdict(rig)},
     }  # fmt: skip
     check_origin(path, env_args)
-    attempt = policy_attempt(options.policy, task, robot, options.explore) if options.policy is not None else None
-    scene = SEED_OFFSET + options.seed + last_scene(path)
+    robots = lockstep_twins(options.rig, task, LANES if options.policy is not None else 1, options.images)
+    first = SEED_OFFSET + options.seed + last_scene(path)
+    if options.policy is not None:
+        recorded = policy_attempts(options.policy, task, robots, options.explore, first)
+    else:
+        recorded = expert_demonstrations(task, robots[0], first)
     failures = 0
     with tqdm(total=options.n, initial=count_episodes(path), unit="demo") as bar:
         while bar.n < options.n:
-            if attempt is not None:
-                seen, done, success = attempt(scene)
-            else:
-                seen, done, success = demonstrate(robot, robot.advance, task, robot.scale, scene)
+            scene, seen, done, success = next(recorded)
             failures += not success
-            if success or attempt is not None:
+            if success or options.policy is not None:
                 objects = np.array(
                     [np.concatenate([[*p.position, *p.quaternion] for p in o.objects.values()]) for o in seen]
                 )
                 write_episode(path, episode_of(seen, done, success, scene), objects, env_args)
                 bar.update()
-            scene += 1
     log.info("%s holds %d episodes; %d attempts failed", path, options.n, failures)
     return 0
 
 
-Recorded = tuple[list[Observation], list[np.ndarray], bool]
+Recorded = tuple[int, list[Observation], list[np.ndarray], bool]
+"""A scene, what was seen and done there, and whether it succeeded."""
 
 
-def policy_attempt(
-    checkpoint: Path, task: TaskConfig, robot: LockstepRobot, explore: float
-) -> Callable[[int], Recorded]:
-    """First attempts of a policy, by scene, in the form of `demonstrate`."""
+def expert_demonstrations(task: TaskConfig, robot: LockstepRobot, first: int) -> Iterator[Recorded]:
+    """The expert's, scene by scene without end."""
+    for scene in itertools.count(first):
+        yield (scene, *demonstrate(robot, robot.advance, task, robot.scale, scene))
+
+
+def policy_attempts(
+    checkpoint: Path, task: TaskConfig, robots: Sequence[LockstepRobot], explore: float, first: int
+) -> Iterator[Recorded]:
+    """First attempts of a policy in the form of `demonstrate`, as many side by side as there are robots."""
     import torch
 
     from far_app.cli.assemble import assemble
     from far_app.config import PerturbationConfig, RetryConfig
     from far_app.detectors import TwinCheck
-    from far_app.session.lockstep import adapt_at_once, run_lockstep
+    from far_app.session.lockstep import Advance, Lane, adapt_at_once, run_together
     from far_app.session.planners import LockstepPlanner
-    from far_app.trial import trial
+    from far_app.trial import TrialEvents, trial
 
     torch.set_num_threads(1)
     once = dataclasses.replace(task, max_attempts=1)
     exploration = PerturbationConfig(
         kind="smoothed", probability=1.0, sigma=explore, dims=(0, 1, 2), first_attempt=1
     )  # fmt: skip
-    method = assemble("perturb", task, str(checkpoint), None, "cpu", RetryConfig(perturbation=exploration)).method
+    retry = RetryConfig(perturbation=exploration)
+    parts = assemble("perturb", task, str(checkpoint), None, "cpu", retry, lanes=len(robots))
+    methods = [parts.another() for _ in robots]
 
-    def attempt(scene: int) -> Recorded:
+    def start(scene: int, lane: int) -> tuple[TrialEvents, Advance]:
+        robot = robots[lane]
+        robot.request(Resume())
         events = trial(
-            scene, robot, LockstepPlanner(), method, TwinCheck(task.success_ticks), once, robot.scale, adapt_at_once
-        )
-        (first,) = run_lockstep(events, robot.advance).attempts
-        actions = [s.sent if np.isfinite(s.sent).all() else s.commanded for s in first.steps]
-        seen = [*(s.observation for s in first.steps), first.final]
-        return seen, [*actions, actions[-1]], first.outcome.success
+            scene, robot, LockstepPlanner(), methods[lane], TwinCheck(task.success_ticks), once, robot.scale,
+            adapt_at_once,
+        )  # fmt: skip
+        return events, robot.advance
 
-    return attempt
+    def failed(lane: Lane, error: RobotError) -> Trial:
+        log.warning("scene %d is left out: %s", lane.job, error)
+        return Trial(scene_seed=lane.job, attempts=(), adaptations=())
+
+    for block in itertools.count(first, len(robots)):  # written in order: what is on disk tells where to go on
+        trials = run_together(range(block, block + len(robots)), len(robots), start, failed)
+        for scene, result in sorted(trials, key=lambda found: found[0]):
+            for attempt in result.attempts:
+                actions = [s.sent if np.isfinite(s.sent).all() else s.commanded for s in attempt.steps]
+                seen = [*(s.observation for s in attempt.steps), attempt.final]
+                yield scene, seen, [*actions, actions[-1]], attempt.outcome.success

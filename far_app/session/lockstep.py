@@ -12,7 +12,7 @@ from far_app.errors import RobotError
 from far_app.protocols import Method, PlanRequest
 from far_app.session.planners import plan_one, plan_together
 from far_app.trial import Adapted, AttemptEnded, RunningAdaptation, Tick, TrialEvents
-from far_app.types import ActionChunk, Adaptation, Attempt, Trial
+from far_app.types import ActionChunk, Adaptation, Attempt, Judge, Trial
 
 Advance = Callable[[], float]
 """Lets one tick of a robot's time pass and returns the new time, seconds."""
@@ -30,7 +30,8 @@ class Lane:
     adaptations: list[Adaptation] = field(default_factory=list)
 
     def step(self) -> PlanRequest | Trial:
-        """On to where it needs a chunk, or to its end. Raises what the trial raises."""
+        """On to where it needs a chunk, or to its end. Raises what the trial raises, and RobotError for a latched
+        arm."""
         while True:
             try:
                 event = self.events.send(self.answer)
@@ -42,6 +43,8 @@ class Lane:
             elif isinstance(event, PlanRequest):
                 return event
             elif isinstance(event, AttemptEnded):
+                if event.attempt.outcome.judged_by is Judge.FAULT:  # nobody is here to see to it and resume
+                    raise RobotError(event.attempt.outcome.note)
                 self.attempts.append(event.attempt)
             elif isinstance(event, Adapted):
                 self.adaptations.append(event.adaptation)
