@@ -1,4 +1,4 @@
-"""What a study found, as Markdown: success by attempt, paired differences from the same scenes, tests, costs.
+"""What results say, as Markdown: success by attempt, paired differences from the same scenes, tests, costs.
 
 Per task: success over its training seeds (mean ± standard deviation), Wilson's 95 % interval over episodes, the exact
 McNemar p against naive retry. Over tasks: the mean difference, with an interval from resampled (task, training seed)
@@ -7,24 +7,29 @@ clusters, because episodes of one model are not independent of each other.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from far_app.errors import ConfigError
+from far_app.evaluation import read_results
+from far_app.paper import PAPER
 from far_app.statistics import costs, mcnemar, paired_difference, solved_within, wilson
 
 RESAMPLES = 10_000
 BASELINE = "nr"
 
-Cluster = tuple[str, int]
-"""A task and a training seed."""
+Cluster = tuple[str, str]
+"""A task and a model of it (a training seed)."""
 Records = Sequence[Mapping[str, Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudyResults:
+class Results:
     arms: tuple[str, ...]
     max_attempts: int
     records: Mapping[Cluster, Records]
@@ -43,14 +48,36 @@ class StudyResults:
         return [c for c in self.records if c[0] == task and self.solved(c, self.arms[0], 1)]
 
 
-def markdown(results: StudyResults) -> str:
+def read_folder(folder: Path) -> Results:
+    """Everything in a folder of `far eval`, or in one with a folder for each model (`far study`). Raises ConfigError
+    when there is nothing, or when two of them compare different things."""
+    plans = sorted(folder.glob("plan.json")) or sorted(folder.glob("*/plan.json"))
+    if not plans:
+        raise ConfigError(
+            f"no results in {folder} (no plan.json there or one folder below); give the --out of far eval"
+        )
+    records: dict[Cluster, Records] = {}
+    compared: tuple[list[dict[str, Any]], int] | None = None
+    for path in plans:
+        plan = json.loads(path.read_text())
+        here = (plan["arms"], plan["max_attempts"])
+        if compared not in (None, here):
+            raise ConfigError(f"{path.parent} compares other methods or settings than {plans[0].parent}; report each")
+        compared = here
+        records[plan["task"], path.parent.name] = read_results(path.with_name("episodes.jsonl"))
+    assert compared is not None
+    arms, max_attempts = compared
+    return Results(arms=tuple(a["name"] for a in arms), max_attempts=max_attempts, records=records)
+
+
+def markdown(results: Results) -> str:
     parts = [task_section(results, task) for task in results.tasks if results.clusters(task)]
     if len(parts) > 1:
         parts.append(pooled_section(results))
     return "\n\n".join(["# Results", *parts]) + "\n"
 
 
-def task_section(results: StudyResults, task: str) -> str:
+def task_section(results: Results, task: str) -> str:
     """One task's tables."""
     clusters, last = results.clusters(task), results.max_attempts
     episodes = sum(len(results.solved(c, results.arms[0], 1)) for c in clusters)
@@ -73,16 +100,22 @@ def task_section(results: StudyResults, task: str) -> str:
         lines.append("| " + " | ".join(cells) + " |")
     lines += [
         "",
-        "| cost | attempts an episode | ticks | adaptations | seconds an adaptation |",
+        "| cost of an episode | attempts (resets) | policy ticks | adaptations | seconds an adaptation |",
         "|---|---|---|---|---|",
     ]
     for arm in results.arms:
         records = [dict(r) for c in clusters for r in results.records[c] if r["arm"] == arm]
         lines.append(f"| {arm} | {' | '.join(costs(records))} |")
+    for paper in PAPER.get(task, ()):
+        lines += [
+            "",
+            f"The paper's, {paper.demonstrations} demonstrations, within 5: dp {paper.dp}, nr {paper.nr}, "
+            f"bgr {paper.bgr}, far {paper.far}.",
+        ]
     return "\n".join(lines)
 
 
-def pooled_section(results: StudyResults) -> str:
+def pooled_section(results: Results) -> str:
     """The mean over tasks, and its differences with intervals from resampled clusters."""
     lines = [
         "## over tasks", "",
@@ -98,7 +131,7 @@ def pooled_section(results: StudyResults) -> str:
     return "\n".join(lines)
 
 
-def together(results: StudyResults, clusters: Sequence[Cluster], arm: str, attempts: int) -> list[bool]:
+def together(results: Results, clusters: Sequence[Cluster], arm: str, attempts: int) -> list[bool]:
     return [solved for c in clusters for solved in results.solved(c, arm, attempts).values()]
 
 
@@ -107,7 +140,7 @@ def rate(solved: Sequence[bool]) -> str:
     return f"{100 * np.mean(solved):.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
-def against(results: StudyResults, clusters: Sequence[Cluster], arm: str) -> list[str]:
+def against(results: Results, clusters: Sequence[Cluster], arm: str) -> list[str]:
     """Paired difference to the baseline, and its exact p."""
     ours, theirs = (together(results, clusters, a, results.max_attempts) for a in (arm, BASELINE))
     mean, low, high = paired_difference(ours, theirs)
@@ -118,7 +151,7 @@ def against(results: StudyResults, clusters: Sequence[Cluster], arm: str) -> lis
     return [f"{100 * mean:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]", f"{p:.3g}"]
 
 
-def pooled(results: StudyResults, arm: str, baseline: str | None) -> str:
+def pooled(results: Results, arm: str, baseline: str | None) -> str:
     """Mean over tasks of the paired difference to a baseline, or to the first attempt; clusters are resampled within
     their tasks."""
     by_task = []

@@ -1,13 +1,15 @@
 """A study says which commands make its models and which scenes judge them; its report counts what is there."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from far_app.cli import main
 from far_app.errors import ConfigError
 from far_app.evaluation import REPORT_SCENES
-from far_app.report import StudyResults, markdown, pooled
+from far_app.report import Results, markdown, pooled, read_folder
 from far_app.study import demonstrating, model_folder, read_study, training
 
 TEXT = """
@@ -78,17 +80,17 @@ def episode(arm: str, scene: int, attempts: int, success: bool) -> dict:
             "adaptations": []}  # fmt: skip
 
 
-def results() -> StudyResults:
+def results() -> Results:
     """Two tasks, two seeds, ten scenes each: nr solves half at once, far all at the second attempt."""
     records = {}
     for task in ("lift", "can"):
         for seed in (0, 1):
             easy = [s < 5 for s in range(10)]
-            records[task, seed] = [
+            records[task, f"{task}-{seed}"] = [
                 *(episode("nr", s, 1 if e else 2, e) for s, e in enumerate(easy)),
                 *(episode("far", s, 1 if e else 2, True) for s, e in enumerate(easy)),
             ]
-    return StudyResults(arms=("nr", "far"), max_attempts=2, records=records)
+    return Results(arms=("nr", "far"), max_attempts=2, records=records)
 
 
 def test_the_report_counts_episodes_seeds_and_pairs():
@@ -104,9 +106,9 @@ def test_the_report_counts_episodes_seeds_and_pairs():
 def test_a_scene_that_an_arm_has_not_run_counts_for_none():
     whole = results()
     torn = dict(whole.records)
-    torn["lift", 0] = [r for r in torn["lift", 0] if not (r["arm"] == "far" and r["scene"] == 9)]
-    part = StudyResults(arms=whole.arms, max_attempts=2, records=torn)
-    assert len(part.solved(("lift", 0), "nr", 2)) == 9
+    torn["lift", "lift-0"] = [r for r in torn["lift", "lift-0"] if not (r["arm"] == "far" and r["scene"] == 9)]
+    part = Results(arms=whole.arms, max_attempts=2, records=torn)
+    assert len(part.solved(("lift", "lift-0"), "nr", 2)) == 9
     assert "19 episodes" in markdown(part)
 
 
@@ -116,10 +118,41 @@ def test_clusters_not_episodes_are_resampled():
     for seed, gain in enumerate((0.0, 0.5, 1.0)):
         nr = rng.random(200) < 0.2
         far = nr | (rng.random(200) < gain)
-        records["lift", seed] = [
+        records["lift", f"lift-{seed}"] = [
             *(episode("nr", s, 2, bool(x)) for s, x in enumerate(nr)),
             *(episode("far", s, 2, bool(x)) for s, x in enumerate(far)),
         ]
-    text = pooled(StudyResults(arms=("nr", "far"), max_attempts=2, records=records), "far", "nr")
+    text = pooled(Results(arms=("nr", "far"), max_attempts=2, records=records), "far", "nr")
     low, high = (float(x) for x in text.split("[")[1].rstrip("]").split(","))
     assert high - low > 40, "seeds that differ so much leave the difference wide open, however many their episodes"
+
+
+def written_results(folder: Path, whole: Results, arms: str = "nr far") -> None:
+    """As far eval leaves them."""
+    for (task, model), records in whole.records.items():
+        (folder / model).mkdir(parents=True)
+        plan = {"task": task, "arms": [{"name": a} for a in arms.split()], "max_attempts": whole.max_attempts}
+        (folder / model / "plan.json").write_text(json.dumps(plan))
+        lines = "".join(json.dumps(r) + "\n" for r in records)
+        (folder / model / "episodes.jsonl").write_text(lines)
+
+
+def test_a_folder_is_reported_as_tables_and_a_picture(tmp_path):
+    written_results(tmp_path, results())
+    assert read_folder(tmp_path) == results()
+    assert main(["report", str(tmp_path)]) == 0
+    text = (tmp_path / "README.md").read_text()
+    assert markdown(read_folder(tmp_path)) in text and "The paper's, 5 demonstrations, within 5: dp 50.0 ± 14.4" in text
+    assert (tmp_path / "success.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["report", str(tmp_path / "lift-0"), "--out", str(tmp_path / "one")]) == 0
+    assert "10 episodes of 1 training seed," in (tmp_path / "one" / "README.md").read_text()
+
+
+def test_what_cannot_be_reported_together_is_named(tmp_path):
+    with pytest.raises(ConfigError, match="no results in"):
+        read_folder(tmp_path)
+    written_results(tmp_path, results())
+    plan = tmp_path / "lift-1" / "plan.json"
+    plan.write_text(plan.read_text().replace("far", "rerank"))
+    with pytest.raises(ConfigError, match=r"lift-1 compares other methods or settings than .*can-0"):
+        read_folder(tmp_path)

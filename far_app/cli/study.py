@@ -16,9 +16,8 @@ from pathlib import Path
 import tyro
 
 from far_app.cli.evaluate import run_plan
+from far_app.cli.report import write_report
 from far_app.errors import FarError
-from far_app.evaluation import read_results
-from far_app.report import StudyResults, markdown
 from far_app.study import Study, demonstrating, model_folder, read_study, training
 
 log = logging.getLogger(__name__)
@@ -43,9 +42,7 @@ def main(arguments: Sequence[str]) -> int:
     for task, seed in study.models:
         print(f"{task.name}, training seed {seed}", flush=True)
         run_plan(folder / f"{task.name}-{seed}", study.plan(folder, task, seed), options.workers)
-    text = markdown(results(study, folder))
-    (folder / "README.md").write_text(text)
-    print(text)
+    print(write_report(folder, folder))
     return 0
 
 
@@ -71,12 +68,3 @@ def command(words: Sequence[str]) -> None:
     if done.returncode != 0:
         last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
         raise FarError(f"`far {' '.join(words)}` failed: {last}")
-
-
-def results(study: Study, folder: Path) -> StudyResults:
-    """What is there so far."""
-    records = {
-        (task.name, seed): read_results(folder / f"{task.name}-{seed}" / "episodes.jsonl")
-        for task, seed in study.models
-    }
-    return StudyResults(arms=tuple(a.name for a in study.arms), max_attempts=study.max_attempts, records=records)
