@@ -1,4 +1,4 @@
-"""Compare ways to retry from the same scenes, in lockstep: one JSONL line an episode, resumable, on several cores.
+"""Compare ways to retry from the same scenes, in lockstep: one JSONL line an episode, resumable, many at once.
 
 Diffusion noise is keyed by (scene, attempt, tick), scenes come from seeds and homing is the same, so attempt 1 is
 identical for every method: a scene solved at the first attempt is solved for all, and is run once.
@@ -6,27 +6,20 @@ identical for every method: a scene solved at the first attempt is solved for al
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import json
-import multiprocessing
-import queue
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from far_app.config import RetryConfig, from_table
-from far_app.errors import ConfigError, FarError
+from far_app.errors import ConfigError
 from far_app.types import Trial
+from far_app.workers import Begin, Block, Work, Workers, local_workers
 
-Job = tuple[int, dict[str, dict[str, Any]]]
-"""A scene, and what is already known of it by arm."""
-Block = Sequence[Job]
 BLOCK = 16
 """Scenes a worker takes at a time."""
 DEV_SCENES = 20_000
@@ -188,8 +181,8 @@ def prepare(folder: Path, plan: EvaluationPlan) -> dict[int, dict[str, dict[str,
 
 
 def evaluate(
-    folder: Path, plan: EvaluationPlan, workers: int, progress: Callable[[dict[str, Any]], None],
-    begin: Callable[[EvaluationPlan], None], work: Callable[[Block], Iterator[dict[str, Any]]],
+    folder: Path, plan: EvaluationPlan, workers: int, progress: Callable[[dict[str, Any]], None], begin: Begin,
+    work: Work, run: Workers = local_workers,
 ) -> None:  # fmt: skip
     """Run what is missing; every finished episode is on disk before the next is counted. `begin` sets a worker process
     up, `work` runs a block of scenes in it; both are importable functions (far_app/cli/evaluate.py)."""
@@ -202,55 +195,10 @@ def evaluate(
     results = folder / "episodes.jsonl"
     if results.exists() and not (whole := results.read_bytes()).endswith(b"\n"):
         results.write_bytes(whole[: whole.rfind(b"\n") + 1])  # a killed run's torn line; its episode is run again
+    if not blocks:
+        return
     with results.open("a") as file:
-        for record in _records(plan, blocks, workers, begin, work):
+        for record in run(plan, blocks, workers, begin, work):
             file.write(json.dumps(record) + "\n")
             file.flush()
             progress(record)
-
-
-def _records(
-    plan: EvaluationPlan, blocks: Sequence[Block], workers: int, begin: Callable, work: Callable
-) -> Iterator[dict[str, Any]]:
-    if not blocks:
-        return
-    if workers <= 1:
-        begin(plan)
-        for block in blocks:
-            yield from work(block)
-        return
-    context = multiprocessing.get_context("spawn")
-    told: Any = context.Queue()
-    with ProcessPoolExecutor(min(workers, len(blocks)), context, _begin_worker, (begin, plan, work, told)) as pool:
-        pending = {pool.submit(_work, block) for block in blocks}
-        expected = heard = 0
-        while pending or heard < expected:
-            with contextlib.suppress(queue.Empty):
-                while True:
-                    yield told.get(timeout=0.2)
-                    heard += 1
-            done, pending = wait(pending, timeout=0)
-            try:
-                expected += sum(future.result() for future in done)
-            except BrokenProcessPool as error:
-                raise FarError("a worker was killed; every finished episode is kept: start again to go on") from error
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-
-
-_TELL: dict[str, Any] = {}
-
-
-def _begin_worker(begin: Callable, plan: EvaluationPlan, work: Callable, told: Any) -> None:
-    begin(plan)
-    _TELL.update(work=work, told=told)
-
-
-def _work(block: Block) -> int:
-    """In a worker: each record to the one who asked, as soon as it is there."""
-    count = 0
-    for record in _TELL["work"](block):
-        _TELL["told"].put(record)
-        count += 1
-    return count

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from tqdm import tqdm
 
@@ -15,12 +15,11 @@ from far_app.cli.assemble import assemble, shipped
 from far_app.cli.lockstep_twin import lockstep_twins
 from far_app.cli.settings import Settings, parse
 from far_app.config import RetryConfig
-from far_app.errors import RobotError
+from far_app.errors import ConfigError, RobotError
 from far_app.evaluation import (
     DEV_SCENES,
     REPORT_SCENES,
     Arm,
-    Block,
     EvaluationPlan,
     evaluate,
     read_arms_file,
@@ -28,8 +27,10 @@ from far_app.evaluation import (
     run_block,
 )
 from far_app.protocols import Resume
+from far_app.ray_workers import ray_workers
 from far_app.tasks import task as find_task
 from far_app.types import Trial
+from far_app.workers import Block, Workers, local_workers
 from hw.rig import load_rig
 
 log = logging.getLogger(__name__)
@@ -54,6 +55,10 @@ class EvaluationOptions:
     critic: Path | None = None
     rig: str = "twin"
     workers: int = 2
+    engine: Literal["local", "ray"] = "local"
+    """Workers as processes of this machine, or on a Ray cluster."""
+    address: str | None = None
+    """With --engine ray: the cluster's address (an own one on this machine otherwise)."""
     out: Path = Path("runs/eval")
     settings: Settings = "model"
     """Begin from what the checkpoint's makers recommend (the retry.toml beside it), or from the paper's settings."""
@@ -77,19 +82,22 @@ def main(arguments: Sequence[str]) -> int:
         first_scene=first, scenes=options.scenes,
         max_attempts=options.attempts,
     )  # fmt: skip
-    run_plan(options.out, plan, options.workers)
+    if options.address is not None and options.engine != "ray":
+        raise ConfigError(f"--address {options.address} was given without --engine ray")
+    run = ray_workers(options.address) if options.engine == "ray" else local_workers
+    run_plan(options.out, plan, options.workers, run)
     print(summary(options.out, plan))
     return 0
 
 
-def run_plan(folder: Path, plan: EvaluationPlan, workers: int) -> None:
+def run_plan(folder: Path, plan: EvaluationPlan, workers: int, run: Workers = local_workers) -> None:
     total = plan.scenes * len(plan.arms)
     with tqdm(total=total, unit="episode") as bar:
 
         def count(record: dict[str, Any]) -> None:
             bar.update()
 
-        evaluate(folder, plan, workers, count, begin, work)
+        evaluate(folder, plan, workers, count, begin, work, run)
 
 
 def summary(folder: Path, plan: EvaluationPlan) -> str:
