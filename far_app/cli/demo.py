@@ -16,21 +16,16 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from far_app.cli.lockstep_twin import lockstep_twins
+from far_app.cli.lockstep_twin import LANES, lockstep_twins, trials
 from far_app.config import TaskConfig
 from far_app.demonstrations import SEED_OFFSET, demonstrate
-from far_app.errors import RobotError
-from far_app.learning.dataset import check_origin, count_episodes, episode_of, last_scene, write_episode
-from far_app.protocols import Resume
+from far_app.learning.dataset import check_origin, count_episodes, episode_of, last_scene, seen_and_done, write_episode
 from far_app.tasks import task as find_task
-from far_app.types import Observation, Trial
+from far_app.types import Observation
 from hw.lockstep import LockstepRobot
 from hw.rig import load_rig
 
 log = logging.getLogger(__name__)
-
-LANES = 8
-"""A policy's attempts side by side."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,10 +70,7 @@ def main(arguments: Sequence[str]) -> int:
             scene, seen, done, success = next(recorded)
             failures += not success
             if success or options.policy is not None:
-                objects = np.array(
-                    [np.concatenate([[*p.position, *p.quaternion] for p in o.objects.values()]) for o in seen]
-                )
-                write_episode(path, episode_of(seen, done, success, scene), objects, env_args)
+                write_episode(path, episode_of(seen, done, success, scene), env_args)
                 bar.update()
     log.info("%s holds %d episodes; %d attempts failed", path, options.n, failures)
     return 0
@@ -102,10 +94,6 @@ def policy_attempts(
 
     from far_app.cli.assemble import assemble
     from far_app.config import PerturbationConfig, RetryConfig
-    from far_app.detectors import TwinCheck
-    from far_app.session.lockstep import Advance, Lane, adapt_at_once, run_together
-    from far_app.session.planners import LockstepPlanner
-    from far_app.trial import TrialEvents, trial
 
     torch.set_num_threads(1)
     once = dataclasses.replace(task, max_attempts=1)
@@ -116,23 +104,8 @@ def policy_attempts(
     parts = assemble("perturb", task, str(checkpoint), None, "cpu", retry, lanes=len(robots))
     methods = [parts.another() for _ in robots]
 
-    def start(scene: int, lane: int) -> tuple[TrialEvents, Advance]:
-        robot = robots[lane]
-        robot.request(Resume())
-        events = trial(
-            scene, robot, LockstepPlanner(), methods[lane], TwinCheck(task.success_ticks), once, robot.scale,
-            adapt_at_once,
-        )  # fmt: skip
-        return events, robot.advance
-
-    def failed(lane: Lane, error: RobotError) -> Trial:
-        log.warning("scene %d is left out: %s", lane.job, error)
-        return Trial(scene_seed=lane.job, attempts=(), adaptations=())
-
     for block in itertools.count(first, len(robots)):  # written in order: what is on disk tells where to go on
-        trials = run_together(range(block, block + len(robots)), len(robots), start, failed)
-        for scene, result in sorted(trials, key=lambda found: found[0]):
+        ended = trials(range(block, block + len(robots)), robots, methods, once)
+        for scene, result in sorted(ended, key=lambda found: found[0]):
             for attempt in result.attempts:
-                actions = [s.sent if np.isfinite(s.sent).all() else s.commanded for s in attempt.steps]
-                seen = [*(s.observation for s in attempt.steps), attempt.final]
-                yield scene, seen, [*actions, actions[-1]], attempt.outcome.success
+                yield (scene, *seen_and_done(attempt), attempt.outcome.success)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,10 +11,10 @@ from typing import Any, Literal
 from tqdm import tqdm
 
 from far_app.cli.assemble import assemble, shipped
-from far_app.cli.lockstep_twin import lockstep_twins
+from far_app.cli.lockstep_twin import LANES, lockstep_twins, trials
 from far_app.cli.settings import Settings, parse
 from far_app.config import RetryConfig
-from far_app.errors import ConfigError, RobotError
+from far_app.errors import ConfigError
 from far_app.evaluation import (
     DEV_SCENES,
     REPORT_SCENES,
@@ -26,14 +25,11 @@ from far_app.evaluation import (
     read_results,
     run_block,
 )
-from far_app.protocols import Resume
 from far_app.ray_workers import ray_workers
 from far_app.tasks import task as find_task
 from far_app.types import Trial
 from far_app.workers import Block, Workers, local_workers
 from hw.rig import load_rig
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,8 +106,6 @@ def summary(folder: Path, plan: EvaluationPlan) -> str:
 
 
 _WORKER: dict[str, Any] = {}
-LANES = 8
-"""Trials side by side in a worker: a chunk in a batch of eight costs a fraction of one alone."""
 
 
 def begin(plan: EvaluationPlan) -> None:
@@ -137,25 +131,4 @@ def work(block: Block) -> Iterator[dict[str, Any]]:
 
 def run_scenes(arm: str, scenes: list[int]) -> Iterator[tuple[int, Trial]]:
     """Trials of one arm, side by side on this worker's twins."""
-    from far_app.detectors import TwinCheck
-    from far_app.session.lockstep import Advance, Lane, adapt_at_once, run_together
-    from far_app.session.planners import LockstepPlanner
-    from far_app.trial import TrialEvents, trial
-
-    task, robots, methods = _WORKER["task"], _WORKER["robots"], _WORKER["methods"][arm]
-
-    def start(scene: int, lane: int) -> tuple[TrialEvents, Advance]:
-        robot = robots[lane]
-        events = trial(
-            scene, robot, LockstepPlanner(), methods[lane], TwinCheck(task.success_ticks), task, robot.scale,
-            adapt_at_once,
-        )  # fmt: skip
-        robot.request(Resume())
-        return events, robot.advance
-
-    def failed(lane: Lane, error: RobotError) -> Trial:
-        """The arm latched (it could not get home, say): the trial ends as it stands."""
-        log.warning("scene %d, %s: %s", lane.job, arm, error)
-        return Trial(scene_seed=lane.job, attempts=tuple(lane.attempts), adaptations=tuple(lane.adaptations))
-
-    return run_together(scenes, len(robots), start, failed)
+    return trials(scenes, _WORKER["robots"], _WORKER["methods"][arm], _WORKER["task"])

@@ -1,12 +1,23 @@
-"""The twin in this process on a simulated clock, as demonstrations, evaluations and benchmarks want it."""
+"""The twin in this process on a simulated clock, as demonstrations, evaluations and benchmarks want it; and trials of
+scenes on several of them."""
 
 from __future__ import annotations
 
+import logging
 import os
+from collections.abc import Iterable, Iterator, Sequence
 
 from far_app.config import TaskConfig
+from far_app.errors import RobotError
+from far_app.protocols import Method, Resume
+from far_app.types import Trial
 from hw.lockstep import LockstepRobot
 from hw.rig import load_rig
+
+log = logging.getLogger(__name__)
+
+LANES = 8
+"""Trials side by side: a chunk in a batch of eight costs a fraction of one alone."""
 
 
 def lockstep_twin(rig_name: str, task: TaskConfig, images: bool = True) -> LockstepRobot:
@@ -25,3 +36,29 @@ def lockstep_twins(rig_name: str, task: TaskConfig, count: int, images: bool = T
     plants = [TwinPlant(rig, task) for _ in range(count)]
     view = TwinView(plants[0].model_xml(), plants[0].base_pose(), plants[0].cameras()) if images else None
     return [LockstepRobot(plant, view, rig, task) for plant in plants]
+
+
+def trials(
+    scenes: Iterable[int], robots: Sequence[LockstepRobot], methods: Sequence[Method], task: TaskConfig
+) -> Iterator[tuple[int, Trial]]:
+    """A trial of each scene, as many side by side as there are robots, each as it ends; a method for each robot."""
+    from far_app.detectors import TwinCheck
+    from far_app.session.lockstep import Advance, Lane, adapt_at_once, run_together
+    from far_app.session.planners import LockstepPlanner
+    from far_app.trial import TrialEvents, trial
+
+    def start(scene: int, lane: int) -> tuple[TrialEvents, Advance]:
+        robot = robots[lane]
+        robot.request(Resume())
+        events = trial(
+            scene, robot, LockstepPlanner(), methods[lane], TwinCheck(task.success_ticks), task, robot.scale,
+            adapt_at_once,
+        )  # fmt: skip
+        return events, robot.advance
+
+    def failed(lane: Lane, error: RobotError) -> Trial:
+        """The arm latched (it could not get home, say): the trial ends as it stands."""
+        log.warning("scene %d, %s: %s", lane.job, methods[0].name, error)
+        return Trial(scene_seed=lane.job, attempts=tuple(lane.attempts), adaptations=tuple(lane.adaptations))
+
+    return run_together(scenes, len(robots), start, failed)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from far_app.errors import ConfigError, RecordingError
-from far_app.types import Observation
+from far_app.types import Attempt, Observation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +43,7 @@ class Episode:
         return len(self.actions)
 
 
-def write_episode(path: Path, episode: Episode, objects: Float[np.ndarray, "N K"], env_args: dict[str, object]) -> None:
+def write_episode(path: Path, episode: Episode, env_args: dict[str, object]) -> None:
     """Append one demonstration to a file (made on first use)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "a") as file:
@@ -60,7 +60,8 @@ def write_episode(path: Path, episode: Episode, objects: Float[np.ndarray, "N K"
         obs["robot0_eef_pos"] = episode.states[:, :3]
         obs["robot0_eef_quat"] = episode.states[:, 3:7]
         obs["robot0_gripper"] = episode.states[:, 7:]
-        obs["object"] = objects.astype(np.float32)
+        if episode.objects is not None:
+            obs["object"] = episode.objects.astype(np.float32)
         data.attrs["total"] = int(data.attrs.get("total", 0)) + len(episode)
 
 
@@ -92,11 +93,8 @@ def check_origin(path: Path, env_args: dict[str, object]) -> None:
 
 def last_scene(path: Path) -> int:
     """How many scenes a file has used, relative to its first one; 0 when there is no file."""
-    if not path.exists():
-        return 0
-    with h5py.File(path, "r") as file:
-        seeds = [int(group.attrs["seed"]) for group in file["data"].values()] if "data" in file else []
-    return max(seeds) - min(seeds) + 1 if seeds else 0
+    scenes = scenes_in(path)
+    return max(scenes) - min(scenes) + 1 if scenes else 0
 
 
 def read_episodes(path: Path, cameras: tuple[str, ...], limit: int | None = None) -> list[Episode]:
@@ -134,4 +132,20 @@ def episode_of(observations: list[Observation], actions: list[np.ndarray], succe
         states=np.stack(states).astype(np.float32), actions=np.stack(actions).astype(np.float32),
         rewards=np.array([o.reward for o in observations], np.float32),
         successes=np.array([bool(o.success) for o in observations]), success=success, seed=seed,
+        objects=np.array([np.concatenate([[*p.position, *p.quaternion] for p in o.objects.values()])
+                          for o in observations]) if observations[0].objects else None,
     )  # fmt: skip
+
+
+def seen_and_done(attempt: Attempt) -> tuple[list[Observation], list[np.ndarray]]:
+    """An attempt as `episode_of` takes it: what was seen, and the actions as sent to the arm."""
+    actions = [s.sent if np.isfinite(s.sent).all() else s.commanded for s in attempt.steps]
+    return [*(s.observation for s in attempt.steps), attempt.final], [*actions, actions[-1]]
+
+
+def scenes_in(path: Path) -> set[int]:
+    """The scenes of a file's episodes; none when there is no file."""
+    if not path.exists():
+        return set()
+    with h5py.File(path, "r") as file:
+        return {int(group.attrs["seed"]) for group in file["data"].values()} if "data" in file else set()

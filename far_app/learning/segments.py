@@ -7,9 +7,11 @@ eight. Pictures are padded once and cropped anew for each segment: the random sh
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from far_app.errors import ConfigError
@@ -17,7 +19,18 @@ from far_app.learning.dataset import Episode
 from far_app.learning.policy import DiffusionPolicy, PolicyConfig
 from far_app.learning.state import states_of
 
-Segments = tuple[dict[str, Tensor], Tensor, Tensor, Tensor | None]
+
+@dataclass(frozen=True, kw_only=True)
+class Segments:
+    """S segments of L consecutive ticks."""
+
+    images: dict[str, UInt8[Tensor, "S L+n_obs−1 P P 3"]]
+    states: Float[Tensor, "S L+n_obs−1 D"]
+    chunks: Float[Tensor, "S L H A"]
+    offsets: Float[Tensor, "S L K"] | None
+    """Of the objects from the hand, where they are known."""
+    rows: Int[np.ndarray, "S L"]
+    """Which of all ticks each is."""
 
 
 class DemonstrationArrays:
@@ -40,9 +53,8 @@ class DemonstrationArrays:
         """Row of the last tick of each row's episode."""
 
     def segments(self, count: int, length: int, rng: np.random.Generator) -> Segments:
-        """`count` segments of `length` ticks: frames (count, length + n_obs − 1, S, S, 3), states, chunks
-        (count, length, H, A), object offsets (count, length, K). Ticks before an episode's first repeat it, actions
-        past its last repeat it."""
+        """`count` segments of `length` ticks. Ticks before an episode's first repeat it, actions past its last repeat
+        it."""
         n_obs, horizon, size = self.config.n_obs, self.config.horizon, self.config.image_size
         rows = rng.integers(0, len(self.ends), count)
         first = np.searchsorted(self.starts, rows, side="right") - 1
@@ -54,7 +66,10 @@ class DemonstrationArrays:
         ticks = frames[:, n_obs - 1 :]
         index = np.minimum(ticks[..., None] + np.arange(horizon), self.ends[rows][:, None, None])
         located = None if self.offsets is None else torch.from_numpy(self.offsets[ticks])
-        return images, torch.from_numpy(self.states[frames]), torch.from_numpy(self.actions[index]), located
+        return Segments(
+            images=images, states=torch.from_numpy(self.states[frames]), chunks=torch.from_numpy(self.actions[index]),
+            offsets=located, rows=ticks,
+        )  # fmt: skip
 
     @staticmethod
     def _cropped(array: np.ndarray, frames: np.ndarray, offsets: np.ndarray, size: int) -> np.ndarray:

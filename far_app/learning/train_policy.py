@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
@@ -72,13 +73,19 @@ TRAININGS = {
 
 
 def denoising_loss(
-    denoiser: Trainable, features: Tensor, chunks: Tensor, generator: torch.Generator, draws: int
+    denoiser: Trainable,
+    features: Tensor,
+    chunks: Tensor,
+    generator: torch.Generator,
+    draws: int,
+    weights: Float[Tensor, "B"] | None = None,
 ) -> Tensor:
-    """E ‖ε − ε_θ(a_k, s, k)‖², averaged over entries."""
+    """E w ‖ε − ε_θ(a_k, s, k)‖², averaged over entries; w is 1 without weights."""
     chunks, condition = chunks.repeat(draws, 1, 1), denoiser.condition(features).repeat(draws, 1)
     k = torch.randint(0, TRAIN_STEPS, (len(chunks),), generator=generator).to(chunks.device)
     noise = torch.randn(chunks.shape, generator=generator).to(chunks.device)
-    return (denoiser.run(add_noise(chunks, noise, k), k, condition) - noise).square().mean()
+    squared = (denoiser.run(add_noise(chunks, noise, k), k, condition) - noise).square()
+    return squared.mean() if weights is None else (squared.mean(dim=(1, 2)) * weights.repeat(draws)).mean()
 
 
 def backward(loss: Tensor, denoiser: Trainable) -> None:
@@ -107,8 +114,13 @@ def train_policy(
     device: str = "cpu",
     card: dict[str, object] | None = None,
     imagenet: dict[str, Tensor] | None = None,
+    start: DiffusionPolicy | None = None,
+    weights: Float[np.ndarray, "N"] | None = None,
 ) -> Path:
-    """Train (or go on training) in a folder; returns the checkpoint (EMA weights). log.jsonl: a line an interval."""
+    """Train (or go on training) in a folder; returns the checkpoint (EMA weights). log.jsonl: a line an interval.
+
+    `start`: finetune this policy, its encoder and normaliser frozen, so that a critic on its features keeps its
+    meaning. `weights`: of every tick of the episodes, side by side (paper, Eq. awr)."""
     torch.manual_seed(training.seed)
     rng = np.random.default_rng(training.seed)
     generator = torch.Generator().manual_seed(training.seed)
@@ -116,13 +128,17 @@ def train_policy(
     if imagenet is not None:
         load_imagenet(policy, imagenet)
     arrays = DemonstrationArrays(episodes, config, training.shift)
-    policy.normalizer.fit(arrays.states)
+    if start is None:
+        policy.normalizer.fit(arrays.states)
+    else:
+        policy.load_state_dict(start.state_dict())
+        policy.encoder.requires_grad_(False)
     policy.to(device)
     ema = copy.deepcopy(policy).requires_grad_(False)
     locator = None
     if training.localise > 0 and arrays.offsets is not None:
         locator = torch.nn.Linear(policy.feature_dim, arrays.offsets.shape[1]).to(device)
-    learnt = [*policy.parameters(), *(locator.parameters() if locator is not None else ())]
+    learnt = [*(p for p in policy.parameters() if p.requires_grad), *(locator.parameters() if locator else ())]
     optimizer = torch.optim.AdamW(learnt, lr=training.lr, betas=(0.95, 0.999), weight_decay=training.weight_decay)
     denoiser = trainable(policy.denoiser, config.horizon)
     state_path = folder / "state.safetensors"
@@ -158,13 +174,15 @@ def train_policy(
         lr = learning_rate(training, iteration)
         for group in optimizer.param_groups:
             group["lr"] = lr
-        images, states, chunks, offsets = arrays.segments(training.batch // training.segment, training.segment, rng)
-        images = {c: v.to(device, non_blocking=True) for c, v in images.items()}
-        features = segment_features(policy, images, states.to(device))
+        drawn = arrays.segments(training.batch // training.segment, training.segment, rng)
+        images = {c: v.to(device, non_blocking=True) for c, v in drawn.images.items()}
+        features = segment_features(policy, images, drawn.states.to(device))
         denoiser.refresh()
-        loss = denoising_loss(denoiser, features, chunks.flatten(0, 1).to(device), generator, training.draws)
-        if locator is not None and offsets is not None:
-            located = (locator(features) - offsets.flatten(0, 1).to(device)).square().mean()
+        weight = None if weights is None else torch.from_numpy(weights[drawn.rows.ravel()]).to(device)
+        chunks = drawn.chunks.flatten(0, 1).to(device)
+        loss = denoising_loss(denoiser, features, chunks, generator, training.draws, weight)
+        if locator is not None and drawn.offsets is not None:
+            located = (locator(features) - drawn.offsets.flatten(0, 1).to(device)).square().mean()
             loss = loss + training.localise * located
         if not torch.isfinite(loss):
             raise PolicyError(
