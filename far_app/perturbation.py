@@ -31,7 +31,9 @@ def probability(config: PerturbationConfig, attempt_index: int) -> float:
     return min(1.0, 0.3 + 0.1 * max(0, attempt_index - 2))
 
 
-def perturbation(config: PerturbationConfig, scene_seed: int, attempt_index: int) -> Perturbation:
+def perturbation(
+    config: PerturbationConfig, scene_seed: int, attempt_index: int, purpose: str = "perturbation"
+) -> Perturbation:
     """δ by tick for one attempt: zeros before config.first_attempt, or when kind is none."""
     if config.kind == "none" or attempt_index < config.first_attempt or config.sigma == 0:
         return lambda tick: np.zeros(ACTION_DIM)
@@ -39,7 +41,7 @@ def perturbation(config: PerturbationConfig, scene_seed: int, attempt_index: int
 
     def drawn(index: int) -> Float[np.ndarray, "A"]:
         """N(0, σ²) on the perturbed dimensions with probability ε, else zeros."""
-        rng = generator("perturbation", scene_seed, attempt_index, index)
+        rng = generator(purpose, scene_seed, attempt_index, index)
         delta = np.zeros(ACTION_DIM)
         if rng.random() < epsilon:
             delta[list(config.dims)] = config.sigma * rng.standard_normal(len(config.dims))

@@ -171,8 +171,11 @@ class Method(Protocol):
     """How to retry: nr, far, bgr … A trial calls begin once, adapt after each failure that has a retry left."""
 
     name: str
-    policy: Policy
-    """The policy that acts now; its version changes after an adaptation."""
+
+    @property
+    def policy(self) -> Policy:
+        """The policy that acts now; its version changes after an adaptation."""
+        ...
 
     def begin(self, scene_seed: int) -> None:
         """A new trial: the base policy returns, memories are cleared."""

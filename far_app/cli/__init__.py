@@ -16,6 +16,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "train critic": ("far_app.cli.train_critic", "train the IQL critic on demonstrations"),
     "eval": ("far_app.cli.evaluate", "compare ways to retry, in lockstep, over many scenes"),
     "study": ("far_app.cli.study", "tasks × training seeds × methods from one file: models, episodes, tables"),
+    "improve": ("far_app.cli.improve", "collect with retries, learn from successes and failures, again and again"),
     "report": ("far_app.cli.report", "tables with intervals and tests, and a picture, of a folder of results"),
     "inspect": ("far_app.cli.inspect", "what a recorded session holds, and what is missing or damaged"),
     "replay": ("far_app.cli.replay", "open a recorded attempt or session in the rerun viewer"),

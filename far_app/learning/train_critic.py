@@ -75,9 +75,12 @@ class CriticTraining:
             raise ConfigError(f"backup is {self.backup}, must be at least 1 tick")
 
 
-def fit(critic: Critic, source: Source, training: CriticTraining, folder: Path, stamp: str = "") -> dict[str, float]:
+def fit(
+    critic: Critic, source: Source, training: CriticTraining, folder: Path, stamp: str = "", standardise: bool = True
+) -> dict[str, float]:
     """Train (or go on training) on transitions; returns the last interval's means. `stamp` names what the features
-    were made with: a saved state with another is refused."""
+    were made with: a saved state with another is refused. A critic that was trained before keeps its inputs'
+    statistics (`standardise` False)."""
     optimizer = torch.optim.AdamW(
         [p for p in critic.parameters() if p.requires_grad], lr=training.lr, weight_decay=0.0, foreach=True
     )
@@ -87,7 +90,7 @@ def fit(critic: Critic, source: Source, training: CriticTraining, folder: Path, 
     }  # fmt: skip
     done = resume(critic, optimizer, state_path, notes)
     probe = np.arange(0, len(source), max(1, len(source) // PROBE))
-    if not done:
+    if not done and standardise:
         with torch.no_grad():
             critic.standardise(source.batch(critic, probe)[0])
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,187 @@
+"""`far improve`: collect with retries, learn from what succeeded and what failed, again and again.
+
+A folder for each epoch: attempts.hdf5, critic.safetensors, policy.safetensors; log.jsonl has a line for each that is
+done. The same command goes on at any point where it was interrupted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tqdm import tqdm
+
+from far_app.cli.assemble import assemble, shipped
+from far_app.cli.evaluate import run_plan
+from far_app.cli.lockstep_twin import LANES, lockstep_twins, trials
+from far_app.cli.settings import Settings, parse
+from far_app.config import RetryConfig, TaskConfig
+from far_app.errors import ConfigError
+from far_app.evaluation import REPORT_SCENES, Arm, EvaluationPlan, differences, identity, read_results
+from far_app.improvement import Collector, Epoch, Improvement, Noisy, read_log, table
+from far_app.tasks import task as find_task
+from hw.rig import load_rig
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImproveOptions:
+    """Improve a policy by its own trials; the base checkpoint is never written to."""
+
+    task: str = "lift"
+    rig: str = "twin"
+    collector: Collector = "far"
+    """How episodes are collected: one attempt, naive retry, or failure-aware retry."""
+    policy: Path | None = None
+    """The shipped quickstart model by default."""
+    critic: Path | None = None
+    """The one beside the policy by default."""
+    data: Path | None = None
+    """Demonstrations, D_exp; datasets/TASK.hdf5 by default."""
+    demonstrations: int | None = None
+    """Use the first so many of them: those the policy was trained on."""
+    out: Path | None = None
+    """runs/improve-TASK-COLLECTOR-SEED by default."""
+    workers: int = 1
+    """For the evaluations, side by side."""
+    settings: Settings = "model"
+    """Begin from what the checkpoint's makers recommend (the retry.toml beside it), or from the paper's settings."""
+    loop: Improvement = field(default_factory=Improvement)
+    retry: RetryConfig = field(default_factory=RetryConfig)
+
+
+def main(arguments: Sequence[str]) -> int:
+    options = parse(ImproveOptions, arguments, "far improve")
+    task = find_task(options.task, load_rig(options.rig).arm)
+    policy = options.policy or shipped(task.name, "policy")
+    critic = options.critic or (
+        policy.with_name("critic.safetensors") if options.policy else shipped(task.name, "critic")
+    )
+    folder = options.out or Path("runs") / f"improve-{task.name}-{options.collector}-{options.loop.seed}"
+    claim(folder, options, policy, critic)
+    run(options, task, folder, policy, critic)
+    print(table(read_log(folder / "log.jsonl")))
+    return 0
+
+
+def claim(folder: Path, options: ImproveOptions, policy: Path, critic: Path) -> None:
+    """ConfigError when the folder holds a run of other settings; the number of epochs may grow."""
+    settings = dataclasses.asdict(options.loop)
+    settings.pop("epochs")
+    plan = json.loads(json.dumps({
+        "task": options.task, "rig": options.rig, "collector": options.collector, "loop": settings,
+        "policy": identity(str(policy)), "critic": identity(str(critic)), "demonstrations": options.demonstrations,
+        "retry": differences(options.retry, RetryConfig()),
+    }))  # fmt: skip
+    note = folder / "plan.json"
+    if note.exists() and json.loads(note.read_text()) != plan:
+        raise ConfigError(f"{folder} holds an improvement of other settings ({note}); give another --out or delete it")
+    folder.mkdir(parents=True, exist_ok=True)
+    note.write_text(json.dumps(plan, indent=1))
+
+
+def run(options: ImproveOptions, task: TaskConfig, folder: Path, policy: Path, critic: Path) -> None:
+    """Every epoch that is not done yet."""
+    import torch
+
+    torch.set_num_threads(1)
+    loop, path = options.loop, folder / "log.jsonl"
+    done = read_log(path)
+    if path.exists():
+        path.write_text("".join(json.dumps(dataclasses.asdict(e)) + "\n" for e in done))  # without a torn line
+    if not done:
+        done = [Epoch(epoch=0, evaluation=evaluate(options, task, folder / "epoch-00", policy, critic))]
+        note(path, done[-1])
+    for number in range(done[-1].epoch + 1, loop.epochs + 1):
+        here = folder / f"epoch-{number:02d}"
+        before = folder / f"epoch-{number - 1:02d}"
+        now = (before / "policy.safetensors", before / "critic.safetensors") if number > 1 else (policy, critic)
+        gained = collect(options, task, here / "attempts.hdf5", *now, loop.scenes(number))
+        better, judge = learn(options, task, folder, number, *now)
+        evaluation = evaluate(options, task, here, better, judge) if loop.evaluated(number) else None
+        last = done[-1]
+        done.append(Epoch(
+            epoch=number, episodes=last.episodes + loop.episodes, timesteps=last.timesteps + gained["timesteps"],
+            solved=gained["solved"], successes=last.successes + gained["successes"],
+            failures=last.failures + gained["failures"], evaluation=evaluation,
+        ))  # fmt: skip
+        note(path, done[-1])
+        log.info("epoch %d: %s", number, dataclasses.asdict(done[-1]))
+
+
+def note(path: Path, epoch: Epoch) -> None:
+    with path.open("a") as file:
+        file.write(json.dumps(dataclasses.asdict(epoch)) + "\n")
+
+
+def collect(
+    options: ImproveOptions, task: TaskConfig, path: Path, policy: Path, critic: Path, scenes: range
+) -> dict[str, int]:
+    """Every attempt of an epoch's episodes into its file; a scene whose episode is there already is left alone."""
+    from far_app.learning.dataset import episode_of, read_episodes, scenes_in, seen_and_done, write_episode
+
+    missing = [s for s in scenes if s not in scenes_in(path)]
+    if missing:
+        attempts = 1 if options.collector == "dp" else options.loop.attempts
+        task = dataclasses.replace(task, max_attempts=attempts)
+        parts = assemble(options.collector, task, str(policy), critic, "cpu", options.retry, lanes=LANES)
+        cameras = parts.method.policy.spec.cameras
+        robots = lockstep_twins(options.rig, task, min(LANES, len(missing)), bool(cameras))
+        methods = [Noisy(parts.another(), options.loop.noise) for _ in robots]
+        rig = robots[0].rig
+        env_args = {
+            "env_name": task.environment, "type": 1,
+            "env_kwargs": {"robots": rig.arm, "rig": dataclasses.asdict(rig)},
+        }  # fmt: skip
+        for scene, result in tqdm(trials(missing, robots, methods, task), total=len(missing), unit="episode"):
+            for attempt in result.attempts:
+                episode = episode_of(*seen_and_done(attempt), attempt.outcome.success, scene)
+                write_episode(path, episode, env_args)
+    episodes = read_episodes(path, ())
+    return {
+        "timesteps": sum(len(e) - 1 for e in episodes), "solved": len({e.seed for e in episodes if e.success}),
+        "successes": sum(e.success for e in episodes), "failures": sum(not e.success for e in episodes),
+    }  # fmt: skip
+
+
+def learn(
+    options: ImproveOptions, task: TaskConfig, folder: Path, number: int, policy: Path, critic: Path
+) -> tuple[Path, Path]:
+    """An epoch's models, from everything collected so far."""
+    from far_app.learning.dataset import read_episodes
+    from far_app.learning.improve import Experience, finetuning
+    from far_app.learning.improve import learn as learn_from
+    from far_app.learning.policy import load_policy
+    from far_app.learning.train_critic import CriticTraining
+
+    config, loop = load_policy(policy, task.name).config, options.loop
+    data = options.data or Path("datasets") / f"{task.name}.hdf5"
+    files = [folder / f"epoch-{n:02d}" / "attempts.hdf5" for n in range(1, number + 1)]
+    collected = [e for file in files for e in read_episodes(file, config.cameras)]
+    experience = Experience(
+        demonstrations=read_episodes(data, config.cameras, options.demonstrations),
+        succeeded=[e for e in collected if e.success], failed=[e for e in collected if not e.success],
+    )  # fmt: skip
+    seed = loop.seed * 1_000 + number
+    return learn_from(
+        policy, critic, experience,
+        CriticTraining(iterations=loop.critic_iterations, reward=loop.reward, backup=loop.backup, seed=seed),
+        finetuning(config.preset, loop.policy_iterations, seed), folder / f"epoch-{number:02d}",
+    )  # fmt: skip
+
+
+def evaluate(options: ImproveOptions, task: TaskConfig, folder: Path, policy: Path, critic: Path) -> dict[str, int]:
+    """The policy alone on the reporting scenes."""
+    plan = EvaluationPlan(
+        task=task.name, rig=options.rig, policy=str(policy), critic=str(critic), arms=(Arm(name="dp", method="dp"),),
+        first_scene=REPORT_SCENES, scenes=options.loop.evaluation_scenes, max_attempts=1,
+    )  # fmt: skip
+    results = folder / "evaluation"
+    run_plan(results, plan, options.workers)
+    records = read_results(results / "episodes.jsonl")
+    return {"scenes": len(records), "solved": sum(r["success"] for r in records)}

@@ -1,0 +1,134 @@
+"""Continual improvement: its scenes, its noise, its log; one real run that goes on where it was cut."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from far_app.cli import main
+from far_app.config import PerturbationConfig
+from far_app.errors import ConfigError
+from far_app.evaluation import DEV_SCENES, REPORT_SCENES
+from far_app.improvement import Epoch, Improvement, Noisy, read_log, table
+from far_app.learning.critic import Critic, CriticShape
+from far_app.learning.critic_file import load_critic, save_critic
+from far_app.learning.dataset import Episode, read_episodes
+from far_app.learning.improve import Experience, advantage_weights, finetuning, learn
+from far_app.learning.policy import DiffusionPolicy, fingerprint, load_policy, preset, save_policy
+from far_app.learning.train_critic import CriticTraining
+from far_app.perturbation import perturbation
+
+
+def test_no_epoch_collects_where_another_did_or_where_policies_are_judged():
+    loops = [Improvement(seed=seed) for seed in (0, 1)]
+    scenes = [s for loop in loops for epoch in range(1, 16) for s in loop.scenes(epoch)]
+    assert len(set(scenes)) == len(scenes) == 2 * 15 * 20
+    assert min(scenes) > max(DEV_SCENES, REPORT_SCENES) + 5_000
+    assert [e for e in range(1, 16) if Improvement().evaluated(e)] == [5, 10, 15]
+    with pytest.raises(ConfigError, match="episodes is 0, must be at least 1"):
+        Improvement(episodes=0)
+
+
+class Retrying:
+    """The part of a Method that noise is added to."""
+
+    name, policy = "retrying", None
+    retry = PerturbationConfig(sigma=1.0, probability=1.0, kind="gaussian")
+
+    def perturb(self, attempt_index, scene_seed):
+        return perturbation(self.retry, scene_seed, attempt_index)
+
+
+def test_every_action_is_noisy_and_a_retry_is_perturbed_besides():
+    noisy, bare = Noisy(Retrying(), 0.1), Retrying()
+    first = np.stack([noisy.perturb(1, 7)(t) for t in range(400)])
+    assert np.abs(first[:, :6].std() - 0.1) < 0.01 and not first[:, 6].any()
+    noise = np.stack([noisy.perturb(2, 7)(t) - bare.perturb(2, 7)(t) for t in range(400)])
+    retry = np.stack([bare.perturb(2, 7)(t) for t in range(400)])
+    assert np.abs(noise[:, :6].std() - 0.1) < 0.01
+    correlation = np.corrcoef(noise[:, :6].ravel(), retry[:, :6].ravel())[0, 1]
+    assert abs(correlation) < 0.1, "its own numbers, not the retry's again"
+
+
+def test_a_torn_line_of_the_log_is_left_out(tmp_path):
+    path = tmp_path / "log.jsonl"
+    epochs = [Epoch(epoch=0, evaluation={"scenes": 50, "solved": 20}), Epoch(epoch=1, episodes=20, timesteps=900)]
+    path.write_text("".join(json.dumps(dataclasses.asdict(e)) + "\n" for e in epochs) + '{"epoch": 2, "epi')
+    assert read_log(path) == epochs
+    assert "| 0 | 0 | 0 | 40.0 [27.6, 53.8] |" in table(epochs)
+
+
+def models(folder):
+    """An untrained state policy for lift, and a critic of it."""
+    torch.manual_seed(0)
+    policy = DiffusionPolicy(preset("state", "lift")).eval()
+    save_policy(policy, folder / "policy.safetensors")
+    shape = CriticShape(features=policy.feature_dim, horizon=policy.config.horizon, action_dim=7, hidden=(16,))
+    save_critic(Critic(shape), policy, folder / "critic.safetensors")
+    return folder / "policy.safetensors", folder / "critic.safetensors"
+
+
+def episodes(count: int, success: bool) -> list[Episode]:
+    rng = np.random.default_rng(count)
+    done = np.arange(20) > 16
+    return [
+        Episode(
+            images={}, states=rng.normal(size=(20, 8)).astype(np.float32),
+            actions=rng.uniform(-1, 1, (20, 7)).astype(np.float32), rewards=rng.random(20).astype(np.float32),
+            successes=done & success, success=success, seed=i, objects=rng.normal(size=(20, 7)).astype(np.float32),
+        )
+        for i in range(count)
+    ]  # fmt: skip
+
+
+def test_an_epoch_moves_both_models_and_never_the_base(tmp_path):
+    base = models(tmp_path / "base")
+    before = [p.read_bytes() for p in base]
+    experience = Experience(
+        demonstrations=episodes(3, True), succeeded=episodes(2, True), failed=episodes(2, False)
+    )  # fmt: skip
+    training = CriticTraining(iterations=5, backup=8)
+    recipe = dataclasses.replace(finetuning("state", 3, 0), batch=8)
+    policy, critic = learn(*base, experience, training, recipe, tmp_path / "epoch-01")
+    assert [p.read_bytes() for p in base] == before
+    old, new = load_policy(base[0]), load_policy(policy)
+    assert fingerprint(old.denoiser) != fingerprint(new.denoiser)
+    assert fingerprint(old.normalizer) == fingerprint(new.normalizer)
+    load_critic(critic, new)  # its features still mean the same
+    again = learn(*base, experience, training, recipe, tmp_path / "again")
+    assert fingerprint(load_policy(again[0])) == fingerprint(new), "the same seeds, the same weights"
+    weights = advantage_weights(new, load_critic(critic, new), episodes(1, True)[0])
+    assert weights.shape == (20,) and (weights > 0).all() and weights.max() <= 100 and math.isfinite(weights.sum())
+
+
+@pytest.mark.slow
+def test_an_improvement_goes_on_where_it_was_cut(tmp_path, monkeypatch):
+    policy, _ = models(tmp_path / "base")
+    data = tmp_path / "lift.hdf5"
+    assert main(["demo", "--rig", "panda", "--n", "1", "--no-images", "--out", str(data)]) == 0
+    words = [
+        "improve", "--rig", "panda", "--collector", "nr", "--policy", str(policy), "--data", str(data),
+        "--loop.episodes", "2", "--loop.attempts", "2", "--loop.critic-iterations", "4",
+        "--loop.policy-iterations", "2", "--loop.evaluate-every", "1", "--loop.evaluation-scenes", "1",
+        "--loop.epochs",
+    ]  # fmt: skip
+    whole = tmp_path / "whole"
+    assert main([*words, "2", "--out", str(whole)]) == 0
+    log = read_log(whole / "log.jsonl")
+    assert [e.epoch for e in log] == [0, 1, 2] and log[2].episodes == 4 and log[2].evaluation is not None
+    assert len(read_episodes(whole / "epoch-01" / "attempts.hdf5", ())) == 4, "every attempt of both episodes"
+
+    parts = tmp_path / "parts"
+    assert main([*words, "1", "--out", str(parts)]) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr("far_app.learning.improve.fit", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert main([*words, "2", "--out", str(parts)]) == 130
+    assert main([*words, "2", "--out", str(parts)]) == 0
+    assert read_log(parts / "log.jsonl") == log
+    assert (parts / "epoch-02/policy.safetensors").read_bytes()[-1000:] == (
+        whole / "epoch-02/policy.safetensors"
+    ).read_bytes()[-1000:]
+    assert main([*words, "2", "--loop.noise", "0.2", "--out", str(parts)]) == 2, "another run's folder is refused"
