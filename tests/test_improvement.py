@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,9 @@ from far_app.learning.improve import Experience, advantage_weights, finetuning, 
 from far_app.learning.policy import DiffusionPolicy, fingerprint, load_policy, preset, save_policy
 from far_app.learning.train_critic import CriticTraining
 from far_app.perturbation import perturbation
+from far_app.recording.episodes import session_episodes
+
+from .recording import sessions
 
 
 def test_no_epoch_collects_where_another_did_or_where_policies_are_judged():
@@ -102,6 +106,31 @@ def test_an_epoch_moves_both_models_and_never_the_base(tmp_path):
     assert fingerprint(load_policy(again[0])) == fingerprint(new), "the same seeds, the same weights"
     weights = advantage_weights(new, load_critic(critic, new), episodes(1, True)[0])
     assert weights.shape == (20,) and (weights > 0).all() and weights.max() <= 100 and math.isfinite(weights.sum())
+
+
+def test_a_recorded_session_is_experience_with_the_last_word_said_on_it(tmp_path):
+    folder = sessions.small_session(tmp_path, steps=12)
+    failed, succeeded = session_episodes(folder, "lift")
+    assert (failed.success, succeeded.success) == (False, True)
+    assert len(failed) == 13 and failed.actions.shape == (13, 7)
+    assert not failed.successes.any() and succeeded.successes.any()
+    with pytest.raises(ConfigError, match="session of task 'lift', these models are for 'can'"):
+        session_episodes(folder, "can")
+
+
+@pytest.mark.slow
+def test_a_policy_is_finetuned_on_the_sample_session(tmp_path):
+    sample = Path(__file__).parents[1] / "recordings" / "sample"
+    data = tmp_path / "lift.hdf5"
+    assert main(["demo", "--n", "1", "--out", str(data)]) == 0
+    out = tmp_path / "improved"
+    words = ["improve", "--from", str(sample), "--data", str(data), "--out", str(out)]
+    few = ["--loop.critic-iterations", "4", "--loop.policy-iterations", "2", "--loop.evaluation-scenes", "1"]
+    assert main([*words, *few]) == 0
+    before, after = read_log(out / "log.jsonl")
+    assert before.evaluation is not None and after.evaluation is not None
+    assert after.successes + after.failures == len(session_episodes(sample, "lift")) > 0
+    assert (out / "epoch-01" / "policy.safetensors").exists()
 
 
 @pytest.mark.slow

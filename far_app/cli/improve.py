@@ -1,7 +1,8 @@
 """`far improve`: collect with retries, learn from what succeeded and what failed, again and again.
 
 A folder for each epoch: attempts.hdf5, critic.safetensors, policy.safetensors; log.jsonl has a line for each that is
-done. The same command goes on at any point where it was interrupted.
+done. The same command goes on at any point where it was interrupted. With --from it learns once, from sessions that
+were recorded, and says how the policy did before and after.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
+import tyro
 from tqdm import tqdm
 
 from far_app.cli.assemble import assemble, shipped
@@ -25,6 +28,9 @@ from far_app.evaluation import REPORT_SCENES, Arm, EvaluationPlan, differences, 
 from far_app.improvement import Collector, Epoch, Improvement, Noisy, read_log, table
 from far_app.tasks import task as find_task
 from hw.rig import load_rig
+
+if TYPE_CHECKING:
+    from far_app.learning.dataset import Episode
 
 log = logging.getLogger(__name__)
 
@@ -45,6 +51,8 @@ class ImproveOptions:
     """Demonstrations, D_exp; datasets/TASK.hdf5 by default."""
     demonstrations: int | None = None
     """Use the first so many of them: those the policy was trained on."""
+    sessions: Annotated[tuple[Path, ...], tyro.conf.arg(name="from")] = ()
+    """Learn once from these recorded sessions, instead of collecting."""
     out: Path | None = None
     """runs/improve-TASK-COLLECTOR-SEED by default."""
     workers: int = 1
@@ -76,7 +84,7 @@ def claim(folder: Path, options: ImproveOptions, policy: Path, critic: Path) -> 
     plan = json.loads(json.dumps({
         "task": options.task, "rig": options.rig, "collector": options.collector, "loop": settings,
         "policy": identity(str(policy)), "critic": identity(str(critic)), "demonstrations": options.demonstrations,
-        "retry": differences(options.retry, RetryConfig()),
+        "retry": differences(options.retry, RetryConfig()), "from": [path.name for path in options.sessions],
     }))  # fmt: skip
     note = folder / "plan.json"
     if note.exists() and json.loads(note.read_text()) != plan:
@@ -97,21 +105,29 @@ def run(options: ImproveOptions, task: TaskConfig, folder: Path, policy: Path, c
     if not done:
         done = [Epoch(epoch=0, evaluation=evaluate(options, task, folder / "epoch-00", policy, critic))]
         note(path, done[-1])
-    for number in range(done[-1].epoch + 1, loop.epochs + 1):
-        here = folder / f"epoch-{number:02d}"
-        before = folder / f"epoch-{number - 1:02d}"
+    for number in range(done[-1].epoch + 1, (1 if options.sessions else loop.epochs) + 1):
+        here, before = folder / f"epoch-{number:02d}", folder / f"epoch-{number - 1:02d}"
         now = (before / "policy.safetensors", before / "critic.safetensors") if number > 1 else (policy, critic)
-        gained = collect(options, task, here / "attempts.hdf5", *now, loop.scenes(number))
-        better, judge = learn(options, task, folder, number, *now)
-        evaluation = evaluate(options, task, here, better, judge) if loop.evaluated(number) else None
-        last = done[-1]
-        done.append(Epoch(
-            epoch=number, episodes=last.episodes + loop.episodes, timesteps=last.timesteps + gained["timesteps"],
-            solved=gained["solved"], successes=last.successes + gained["successes"],
-            failures=last.failures + gained["failures"], evaluation=evaluation,
-        ))  # fmt: skip
+        if not options.sessions:
+            collect(options, task, here / "attempts.hdf5", *now, loop.scenes(number))
+        by_epoch = experience(options, task, folder, number, policy)
+        better, judge = learn(options, task, here, number, *now, [e for found in by_epoch for e in found])
+        judged = options.sessions or loop.evaluated(number)
+        evaluation = evaluate(options, task, here, better, judge) if judged else None
+        done.append(counted(number, by_epoch, evaluation))
         note(path, done[-1])
         log.info("epoch %d: %s", number, dataclasses.asdict(done[-1]))
+
+
+def counted(number: int, by_epoch: Sequence[Sequence[Episode]], evaluation: dict[str, int] | None) -> Epoch:
+    """A line of the log."""
+    everything = [e for found in by_epoch for e in found]
+    return Epoch(
+        epoch=number, episodes=sum(len({e.seed for e in found}) for found in by_epoch),
+        timesteps=sum(len(e) - 1 for e in everything), solved=len({e.seed for e in by_epoch[-1] if e.success}),
+        successes=sum(e.success for e in everything), failures=sum(not e.success for e in everything),
+        evaluation=evaluation,
+    )  # fmt: skip
 
 
 def note(path: Path, epoch: Epoch) -> None:
@@ -119,11 +135,9 @@ def note(path: Path, epoch: Epoch) -> None:
         file.write(json.dumps(dataclasses.asdict(epoch)) + "\n")
 
 
-def collect(
-    options: ImproveOptions, task: TaskConfig, path: Path, policy: Path, critic: Path, scenes: range
-) -> dict[str, int]:
+def collect(options: ImproveOptions, task: TaskConfig, path: Path, policy: Path, critic: Path, scenes: range) -> None:
     """Every attempt of an epoch's episodes into its file; a scene whose episode is there already is left alone."""
-    from far_app.learning.dataset import episode_of, read_episodes, scenes_in, seen_and_done, write_episode
+    from far_app.learning.dataset import episode_of, scenes_in, seen_and_done, write_episode
 
     missing = [s for s in scenes if s not in scenes_in(path)]
     if missing:
@@ -142,15 +156,31 @@ def collect(
             for attempt in result.attempts:
                 episode = episode_of(*seen_and_done(attempt), attempt.outcome.success, scene)
                 write_episode(path, episode, env_args)
-    episodes = read_episodes(path, ())
-    return {
-        "timesteps": sum(len(e) - 1 for e in episodes), "solved": len({e.seed for e in episodes if e.success}),
-        "successes": sum(e.success for e in episodes), "failures": sum(not e.success for e in episodes),
-    }  # fmt: skip
+
+
+def experience(
+    options: ImproveOptions, task: TaskConfig, folder: Path, epochs: int, policy: Path
+) -> list[list[Episode]]:
+    """Every attempt there is to learn from, by epoch; those of recorded sessions count as one."""
+    from far_app.learning.dataset import read_episodes
+    from far_app.learning.policy import load_policy
+    from far_app.recording.episodes import session_episodes
+
+    if options.sessions:
+        return [[e for session in options.sessions for e in session_episodes(session, task.name)]]
+    cameras = load_policy(policy, task.name).config.cameras
+    files = [folder / f"epoch-{n:02d}" / "attempts.hdf5" for n in range(1, epochs + 1)]
+    return [read_episodes(file, cameras) for file in files]
 
 
 def learn(
-    options: ImproveOptions, task: TaskConfig, folder: Path, number: int, policy: Path, critic: Path
+    options: ImproveOptions,
+    task: TaskConfig,
+    folder: Path,
+    number: int,
+    policy: Path,
+    critic: Path,
+    collected: Sequence[Episode],
 ) -> tuple[Path, Path]:
     """An epoch's models, from everything collected so far."""
     from far_app.learning.dataset import read_episodes
@@ -161,17 +191,15 @@ def learn(
 
     config, loop = load_policy(policy, task.name).config, options.loop
     data = options.data or Path("datasets") / f"{task.name}.hdf5"
-    files = [folder / f"epoch-{n:02d}" / "attempts.hdf5" for n in range(1, number + 1)]
-    collected = [e for file in files for e in read_episodes(file, config.cameras)]
-    experience = Experience(
+    known = Experience(
         demonstrations=read_episodes(data, config.cameras, options.demonstrations),
         succeeded=[e for e in collected if e.success], failed=[e for e in collected if not e.success],
     )  # fmt: skip
     seed = loop.seed * 1_000 + number
     return learn_from(
-        policy, critic, experience,
+        policy, critic, known,
         CriticTraining(iterations=loop.critic_iterations, reward=loop.reward, backup=loop.backup, seed=seed),
-        finetuning(config.preset, loop.policy_iterations, seed), folder / f"epoch-{number:02d}",
+        finetuning(config.preset, loop.policy_iterations, seed), folder,
     )  # fmt: skip
 
 
