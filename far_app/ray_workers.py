@@ -1,7 +1,7 @@
 """Workers on a Ray cluster: the same blocks, the same records. A worker that dies is replaced, and the rest of its
 block goes to the next one; what it had told is kept, so nothing is lost or counted twice.
 
-Ray is an optional extra. Checkpoints must lie at the same paths on every machine. `pip install 'far-app[ray]'`
+Ray is an optional extra. Checkpoints must lie at the same paths on every machine.
 """
 
 from __future__ import annotations
@@ -36,7 +36,6 @@ def ray_workers(address: str | None = None) -> Workers:
     """Workers on the cluster at `address`, or on one of this machine's own that ends with the run. Raises ConfigError
     where Ray is not installed."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
         import ray
     except ImportError as error:

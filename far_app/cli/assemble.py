@@ -42,6 +42,12 @@ def shipped(task: str, kind: str) -> Path:
     return CHECKPOINTS / f"{task}.{kind}.safetensors"
 
 
+def checkpoints(task: str, policy: Path | None, critic: Path | None) -> tuple[Path, Path]:
+    """The files of a model: those given, the critic beside a policy that was given, else the shipped ones."""
+    beside = policy.with_name("critic.safetensors") if policy is not None else shipped(task, "critic")
+    return policy or shipped(task, "policy"), critic or beside
+
+
 def assemble(
     method: str,
     task: TaskConfig,

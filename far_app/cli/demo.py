@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from far_app.cli.lockstep_twin import LANES, lockstep_twins, trials
+from far_app.cli.lockstep_twin import LANES, lockstep_twins, origin, trials
 from far_app.config import TaskConfig
 from far_app.demonstrations import SEED_OFFSET, demonstrate
 from far_app.learning.dataset import check_origin, count_episodes, episode_of, last_scene, seen_and_done, write_episode
@@ -54,9 +54,7 @@ def main(arguments: Sequence[str]) -> int:
     rig = load_rig(options.rig)
     task = find_task(options.task, rig.arm)
     path = options.out or Path("datasets") / f"{task.name}.hdf5"
-    env_args = {
-        "env_name": task.environment, "type": 1, "env_kwargs": {"robots": rig.arm, "rig": dataclasses.asdict(rig)},
-    }  # fmt: skip
+    env_args = origin(task, rig)
     check_origin(path, env_args)
     robots = lockstep_twins(options.rig, task, LANES if options.policy is not None else 1, options.images)
     first = SEED_OFFSET + options.seed + last_scene(path)

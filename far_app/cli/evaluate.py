@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from tqdm import tqdm
 
-from far_app.cli.assemble import assemble, shipped
+from far_app.cli.assemble import assemble, checkpoints
 from far_app.cli.lockstep_twin import LANES, lockstep_twins, trials
 from far_app.cli.settings import Settings, parse
 from far_app.config import RetryConfig
@@ -64,10 +64,7 @@ class EvaluationOptions:
 def main(arguments: Sequence[str]) -> int:
     options = parse(EvaluationOptions, arguments, "far eval")
     task = find_task(options.task, load_rig(options.rig).arm)
-    policy = options.policy or shipped(task.name, "policy")
-    critic = options.critic or (
-        policy.with_name("critic.safetensors") if options.policy else shipped(task.name, "critic")
-    )
+    policy, critic = checkpoints(task.name, options.policy, options.critic)
     kind = REPORT_SCENES if options.report else DEV_SCENES
     first = kind if options.first_scene is None else options.first_scene
     plan = EvaluationPlan(

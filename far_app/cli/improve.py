@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tqdm import tqdm
 
-from far_app.cli.assemble import assemble, shipped
+from far_app.cli.assemble import assemble, checkpoints
 from far_app.cli.evaluate import run_plan
-from far_app.cli.lockstep_twin import LANES, lockstep_twins, trials
+from far_app.cli.lockstep_twin import LANES, lockstep_twins, origin, trials
 from far_app.cli.settings import Settings, parse
 from far_app.config import RetryConfig, TaskConfig
 from far_app.errors import ConfigError
@@ -66,10 +66,7 @@ class ImproveOptions:
 def main(arguments: Sequence[str]) -> int:
     options = parse(ImproveOptions, arguments, "far improve")
     task = find_task(options.task, load_rig(options.rig).arm)
-    policy = options.policy or shipped(task.name, "policy")
-    critic = options.critic or (
-        policy.with_name("critic.safetensors") if options.policy else shipped(task.name, "critic")
-    )
+    policy, critic = checkpoints(task.name, options.policy, options.critic)
     folder = options.out or Path("runs") / f"improve-{task.name}-{options.collector}-{options.loop.seed}"
     claim(folder, options, policy, critic)
     run(options, task, folder, policy, critic)
@@ -147,11 +144,7 @@ def collect(options: ImproveOptions, task: TaskConfig, path: Path, policy: Path,
         cameras = parts.method.policy.spec.cameras
         robots = lockstep_twins(options.rig, task, min(LANES, len(missing)), bool(cameras))
         methods = [Noisy(parts.another(), options.loop.noise) for _ in robots]
-        rig = robots[0].rig
-        env_args = {
-            "env_name": task.environment, "type": 1,
-            "env_kwargs": {"robots": rig.arm, "rig": dataclasses.asdict(rig)},
-        }  # fmt: skip
+        env_args = origin(task, robots[0].rig)
         for scene, result in tqdm(trials(missing, robots, methods, task), total=len(missing), unit="episode"):
             for attempt in result.attempts:
                 episode = episode_of(*seen_and_done(attempt), attempt.outcome.success, scene)

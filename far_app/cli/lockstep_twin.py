@@ -3,6 +3,7 @@ scenes on several of them."""
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,7 +13,7 @@ from far_app.errors import RobotError
 from far_app.protocols import Method, Resume
 from far_app.types import Trial
 from hw.lockstep import LockstepRobot
-from hw.rig import load_rig
+from hw.rig import RigConfig, load_rig
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +37,14 @@ def lockstep_twins(rig_name: str, task: TaskConfig, count: int, images: bool = T
     plants = [TwinPlant(rig, task) for _ in range(count)]
     view = TwinView(plants[0].model_xml(), plants[0].base_pose(), plants[0].cameras()) if images else None
     return [LockstepRobot(plant, view, rig, task) for plant in plants]
+
+
+def origin(task: TaskConfig, rig: RigConfig) -> dict[str, object]:
+    """Where a dataset's episodes come from, as robomimic's env_args."""
+    return {
+        "env_name": task.environment, "type": 1,
+        "env_kwargs": {"robots": rig.arm, "rig": dataclasses.asdict(rig)},
+    }  # fmt: skip
 
 
 def trials(
