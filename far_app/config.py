@@ -72,6 +72,9 @@ class PairsConfig:
     """Leave the gripper dimension out of d(·,·) (one flipped gripper tick alone would add 2.0)."""
     on_empty: Literal["drop_d_max", "skip"] = "drop_d_max"
     """What to do with a state whose filtered set is empty; both are counted."""
+    explore: float = 0.0
+    """σ of the constant translation added to each candidate, action units; 0 is the paper. A policy that is sure of its
+    mistake samples nothing better: a retry is perturbed anyway, and Q can say which perturbation would have helped."""
     choose: Literal["critic", "random"] = "critic"
     """TopK by Q, or the paper's random ablation."""
 
@@ -79,6 +82,7 @@ class PairsConfig:
         _check(self.candidates >= 1, "pairs.candidates", self.candidates, "at least 1")
         _check(1 <= self.positives <= self.candidates, "pairs.positives", self.positives, f"1 to {self.candidates}")
         _check(self.d_max > 0, "pairs.d_max", self.d_max, "above 0")
+        _check(self.explore >= 0, "pairs.explore", self.explore, "at least 0")
 
 
 @dataclass(frozen=True, kw_only=True)

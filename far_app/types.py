@@ -17,6 +17,8 @@ ACTION_DIM = 7
 """Three translations, three rotations (rotation vector, base frame), the gripper (−1 opens, +1 closes)."""
 ARM_DIMS = 6
 """The arm's part of an action; the gripper is dimension 6."""
+TRANSLATION_DIMS = 3
+"""The part of it that moves the hand in x, y, z."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -62,13 +62,14 @@ def main(arguments: Sequence[str]) -> int:
         recorded = policy_attempts(options.policy, task, robots, options.explore, first)
     else:
         recorded = expert_demonstrations(task, robots[0], first)
-    failures = 0
-    with tqdm(total=options.n, initial=count_episodes(path), unit="demo") as bar:
-        while bar.n < options.n:
+    failures, there = 0, count_episodes(path)
+    with tqdm(total=options.n, initial=there, unit="demo") as bar:
+        while there < options.n:  # not the bar's own count: a bar that is switched off counts nothing
             scene, seen, done, success = next(recorded)
             failures += not success
             if success or options.policy is not None:
                 write_episode(path, episode_of(seen, done, success, scene), env_args)
+                there += 1
                 bar.update()
     log.info("%s holds %d episodes; %d attempts failed", path, options.n, failures)
     return 0

@@ -13,13 +13,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from far_app.config import PairsConfig
 from far_app.learning.cancellation import Cancelled, check
-from far_app.types import ARM_DIMS
+from far_app.types import ARM_DIMS, TRANSLATION_DIMS
 
 BATCH = 64
 """Chunks a pass; small enough that a cancellation is noticed within a few tens of milliseconds."""
@@ -68,6 +69,19 @@ def candidates(
         check(cancelled)
         chunks.append(sample(features[state[rows]], flat[rows]))
     return torch.cat(chunks).reshape(noise.shape)
+
+
+def explored(
+    chunks: Float[Tensor, "S M H A"], sigma: float, rng: np.random.Generator
+) -> Float[Tensor, "S M H A"]:
+    """Every candidate moved by a translation of its own, the same at all its steps: a^(i) + δ, δ ~ N(0, σ²) in x, y, z.
+    A state's first candidate stays the policy's own."""
+    states, per_state = chunks.shape[:2]
+    offsets = sigma * rng.standard_normal((states, per_state, 1, TRANSLATION_DIMS), dtype=np.float32)
+    offsets[:, 0] = 0.0
+    moved = chunks.clone()
+    moved[..., :TRANSLATION_DIMS] += torch.from_numpy(offsets).to(chunks.device)
+    return moved.clamp(-1.0, 1.0)
 
 
 def distance(

@@ -57,7 +57,7 @@ class PolicyConfig:
 
 
 PRESETS: dict[str, dict[str, Any]] = {
-    "state": {"encoder": "none", "cameras": (), "widths": (64, 128, 256), "ddim_steps": 8},
+    "state": {"encoder": "none", "cameras": (), "widths": (32, 64, 128), "ddim_steps": 8},
     "quickstart": {"encoder": "light", "widths": (64, 128, 256), "ddim_steps": 8},
     "paper": {"encoder": "resnet18", "widths": (64, 128, 256), "ddim_steps": 16},
 }

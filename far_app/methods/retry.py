@@ -22,7 +22,7 @@ from far_app.errors import ConfigError, FarError
 from far_app.learning import diffusion, fcpa
 from far_app.learning.cancellation import AdaptationCancelledError, Cancelled, check
 from far_app.learning.critic import Critic
-from far_app.learning.pairs import Pairs, candidates, merged, select, weighted_trajectory
+from far_app.learning.pairs import Pairs, candidates, explored, merged, select, weighted_trajectory
 from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.preference import Demonstrations, Noising
 from far_app.learning.steering import Steering
@@ -202,6 +202,8 @@ class _Learning:
             chunks = candidates(sample, runner.condition(seen), stacked.to(seen.device), self.cancelled)
             if not bool(torch.isfinite(chunks).all()):
                 raise FarError(f"the policy {method.policy.version} sampled a non-finite candidate; nothing was learnt")
+            if config.explore > 0:
+                chunks = explored(chunks, config.explore, self._rng("exploration"))
             self.note("candidates")
             return select(chunks, seen, negatives, critic.q, config, shown)
 

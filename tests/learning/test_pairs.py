@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from far_app.config import PairsConfig
 from far_app.learning.cancellation import AdaptationCancelledError, never
-from far_app.learning.pairs import BATCH, candidates, distance, merged, moderate, select, top_k, weighted_trajectory
+from far_app.learning.pairs import BATCH, candidates, distance, explored, merged, moderate, select, top_k, weighted_trajectory
 
 H, A = 3, 7
 
@@ -48,6 +48,21 @@ def test_an_empty_set_drops_d_max_and_is_counted_or_skips_the_state():
     safe, empty = moderate(distances, PairsConfig(on_empty="skip"))
     assert not safe.any()
     assert empty.tolist() == [True]
+
+
+def test_exploring_moves_a_candidate_by_one_translation_and_leaves_the_first_alone():
+    chunks = 0.2 * torch.rand(2, 5, H, A) - 0.1
+    moved = explored(chunks, 0.3, np.random.default_rng(0))
+    offsets = moved - chunks
+    assert torch.equal(moved[:, 0], chunks[:, 0])
+    assert torch.equal(moved[..., 3:], chunks[..., 3:])  # neither rotation nor gripper
+    assert torch.allclose(offsets[:, :, :1].expand_as(offsets), offsets, atol=1e-6)
+    assert offsets[:, 1:, 0, :3].abs().min() > 0
+
+
+def test_explored_candidates_are_actions():
+    moved = explored(torch.ones(1, 64, H, A), 2.0, np.random.default_rng(0))
+    assert moved.abs().max() == 1.0
 
 
 def test_d_min_may_be_a_number():
