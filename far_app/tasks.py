@@ -25,7 +25,7 @@ TASKS: dict[str, TaskConfig] = {
     ),
     "door": TaskConfig(
         name="door", environment="Door", horizon=200, repeat=3,
-        objects=(("handle", "Door_handle"), ("door", "Door_door")),
+        objects=(("handle", "Door_handle"), ("door", "Door_door")), retreat=(0.0, 0.10, 0.0),
     ),
     "bread": TaskConfig(
         name="bread", environment="PickPlaceBread", horizon=200, repeat=3,

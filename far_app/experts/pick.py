@@ -57,9 +57,20 @@ def pick(
     return [
         Phase(goal=over, gripper=-1.0, near=0.012),
         Phase(goal=down, gripper=-1.0, near=0.008, patience=2.0, lost=strayed),
-        Phase(goal=down, gripper=1.0, near=0.02, turn=0.3, dwell=style.dwell, patience=1.0),
+        Phase(goal=down, gripper=1.0, done=Closed(), least=style.dwell, patience=2.0),
         Phase(goal=up, gripper=1.0, near=0.02, turn=0.5, lost=slipped(grasp)),
     ]
+
+
+class Closed:
+    """Whether the fingers have come to rest on something (or on each other)."""
+
+    def __init__(self) -> None:
+        self.before = 1.0
+
+    def __call__(self, observation: Observation) -> bool:
+        moved, self.before = self.before - observation.gripper, observation.gripper
+        return observation.gripper < 0.97 and abs(moved) < 0.02
 
 
 def slipped(grasp: Callable[[Observation], np.ndarray]) -> Callable[[Observation], bool]:

@@ -8,19 +8,28 @@ from far_app.experts.pick import Held, carried, pick, slipped
 from far_app.experts.script import Hand, Phase, Script, Steady, folded, turned, yaw_of
 from far_app.types import Observation, Pose
 
-ABOVE = 0.21
+ABOVE = 0.19
 """Metres above the table at which the nut passes over the peg's tip."""
+TIP = 0.13
+"""Metres above the table, of the peg."""
 HANDLE_SIDES = (np.pi / 2, np.pi, -np.pi / 2)
 """Where the handle may point when the nut is over the peg, radians: the arm reaches no further."""
-SEATED = 0.02
-"""Metres above the table to which the hand lowers the nut."""
+OUTWARD = 0.010
+"""Metres beyond the handle's middle at which it is taken: broad fingers would stand on the ring."""
+ALIGNED = 0.005
+"""Metres beside the peg with which the nut may begin to go down."""
+THREADED = 0.012
+"""Metres beside the peg at which a nut below its tip can only be around it."""
 
 
 def square(hand: Hand, start: Pose) -> Script:
     steady = Steady(np.pi)
 
     def handle(observation: Observation) -> np.ndarray:
-        return observation.objects["handle"].position
+        """Where to take it."""
+        middle = observation.objects["handle"].position
+        outward = middle - observation.objects["nut"].position
+        return middle + OUTWARD * outward / np.linalg.norm(outward)
 
     def nut(observation: Observation) -> Pose:
         return observation.objects["nut"]
@@ -28,15 +37,21 @@ def square(hand: Hand, start: Pose) -> Script:
     def across(observation: Observation) -> float:
         return steady(yaw_of(nut(observation).quaternion))
 
-    def to_peg(up: float):
-        def goal(observation: Observation) -> Pose:
-            peg = observation.objects["peg"].position
-            error = square_error(observation)
-            at = np.array((peg[0], peg[1], table(observation) + up))
-            wish = turned_by(observation.eef.quaternion, -error)
-            return carried(observation, nut(observation).position, at, wish)
+    def over_peg(observation: Observation, up: float = ABOVE) -> Pose:
+        peg = observation.objects["peg"].position
+        at = np.array((peg[0], peg[1], table(observation) + up))
+        wish = turned_by(observation.eef.quaternion, -square_error(observation))
+        return carried(observation, nut(observation).position, at, wish)
 
-        return goal
+    def onto_peg(observation: Observation) -> Pose:
+        """Down while the nut is where the hole meets the peg, else back over its tip."""
+        offset = nut(observation).position - observation.objects["peg"].position
+        below = nut(observation).position[2] < table(observation) + TIP - 0.01
+        beside = float(np.linalg.norm(offset[:2]))
+        return over_peg(observation, 0.0 if beside < (THREADED if below else 2 * ALIGNED) else ABOVE)
+
+    def seated(observation: Observation) -> bool:
+        return bool(nut(observation).position[2] < table(observation) + 0.03)
 
     def square_error(observation: Observation) -> float:
         """From the nearest of the three orientations in which the handle does not point away from the arm."""
@@ -46,16 +61,16 @@ def square(hand: Hand, start: Pose) -> Script:
     lost = slipped(handle)
     return Script(hand, [
         *pick(hand, start, handle, across, height=ABOVE, held=Held()),
-        Phase(goal=to_peg(ABOVE), gripper=1.0, near=0.005, turn=0.05, patience=4.0, lost=lost),
-        Phase(goal=to_peg(SEATED), gripper=1.0, near=0.01, turn=0.2, patience=2.0, lost=lost),
+        Phase(goal=over_peg, gripper=1.0, near=ALIGNED, turn=0.06, pace=0.85, dwell=0.2, patience=5.0, lost=lost),
+        Phase(goal=onto_peg, gripper=1.0, done=seated, patience=4.0, lost=lost),
         Phase(goal=lambda o: Pose(position=o.eef.position, quaternion=o.eef.quaternion), gripper=-1.0, dwell=0.5),
         Phase(goal=lambda o: Pose(position=o.eef.position + (0, 0, 0.05), quaternion=o.eef.quaternion), gripper=-1.0),
     ])  # fmt: skip
 
 
 def table(observation: Observation) -> float:
-    """Height of the table's top: the peg's body stands 0.05 m above it."""
-    return float(observation.objects["peg"].position[2] - 0.05)
+    """Height of the table's top: the peg's middle is 0.03 m above it."""
+    return float(observation.objects["peg"].position[2] - 0.03)
 
 
 def turned_by(quaternion: np.ndarray, yaw: float) -> np.ndarray:
