@@ -1,7 +1,7 @@
 """One rig, one TOML file: limits, start pose, action scale, cameras; what differs at a task's station in its own table.
 
-    [station.can]               # for the task `can` this is laid over the file's own settings, key by key
-    base = [-0.28, -0.08, 0.912]
+[station.can]               # for the task `can` this is laid over the file's own settings, key by key
+base = [-0.28, -0.08, 0.912]
 """
 
 from __future__ import annotations
@@ -111,5 +111,7 @@ def load_rig(name_or_path: str, task: str = "") -> RigConfig:
 
 def laid_over(table: dict[str, Any], station: dict[str, Any]) -> dict[str, Any]:
     """The file's settings with a station's in their place, table by table."""
-    both = {key: laid_over(table[key], station[key]) for key in table.keys() & station.keys() if isinstance(table[key], dict)}
-    return {**table, **station, **both}
+    both = dict(table)
+    for key, value in station.items():
+        both[key] = laid_over(table[key], value) if isinstance(value, dict) and key in table else value
+    return both

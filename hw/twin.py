@@ -24,7 +24,7 @@ from hw.osc import OperationalSpace
 from hw.plant import Measured
 from hw.rig import RigConfig
 from hw.twin_arms import ARMS
-from hw.twin_view import FRONT, CameraPlacement
+from hw.twin_view import CameraPlacement
 
 SERVO_HZ = 120
 SUBSTEPS = 4
@@ -208,7 +208,9 @@ class TwinPlant:
 
     def cameras(self) -> dict[str, CameraPlacement]:
         """Where the cameras are, by name."""
-        return {"front": FRONT, "wrist": self.arm.wrist}
+        position, target = self.task.front
+        front = CameraPlacement(position=position, target=target, up=(0, 0, 1), fovy=48.0)
+        return {"front": front, "wrist": self.arm.wrist}
 
     def base_pose(self) -> Pose:
         """The arm's base in the world."""

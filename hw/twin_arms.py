@@ -16,8 +16,8 @@ class TwinArm:
     finger_joints: tuple[tuple[str, float, float], ...]
     """The joints by whose mean the opening is measured: name, position when closed and when open, radians or metres."""
     elbow_stop: float
-    """Where joint 4 stops, radians: just short of the stretched arm. Beyond it the elbow bends the other way, and the way
-    home leads into the joint's own end."""
+    """Where joint 4 stops, radians: just short of the stretched arm. Beyond it the elbow bends the other way, and the
+    way home leads into the joint's own end."""
     wrist: CameraPlacement
     """The camera on the hand."""
 

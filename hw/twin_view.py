@@ -42,9 +42,6 @@ class CameraPlacement:
     body: str = "world"
 
 
-FRONT = CameraPlacement(position=(0.62, 0.0, 1.42), target=(-0.03, 0.0, 0.93), up=(0, 0, 1), fovy=48.0)
-
-
 def look_at(camera: CameraPlacement) -> Float[np.ndarray, "4"]:
     """Orientation (wxyz, MuJoCo) of a camera that looks along −z with y up."""
     back = np.subtract(camera.position, camera.target)

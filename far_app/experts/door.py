@@ -57,6 +57,7 @@ def door(hand: Hand, start: Pose) -> Script:
         return at(observation, np.zeros(3))
 
     def around(observation: Observation) -> bool:
+        """The lever is between the fingers."""
         return bool(np.linalg.norm(there(observation).position - observation.eef.position) < 0.012)
 
     def onward(observation: Observation) -> np.ndarray:
@@ -78,7 +79,7 @@ def door(hand: Hand, start: Pose) -> Script:
 
     return Script(hand, [
         Phase(goal=before, gripper=-1.0, near=0.012, turn=0.08),
-        Phase(goal=onto, gripper=-1.0, near=0.012, pace=0.7, done=around, patience=3.0),
+        Phase(goal=onto, gripper=-1.0, pace=0.7, done=around, patience=3.0),
         Phase(goal=there, gripper=1.0, near=0.03, turn=0.3, dwell=style.dwell, patience=1.0),
         Phase(goal=turn, gripper=1.0, done=lambda o: turned_down(o) > PRESSED, patience=4.0, lost=lost),
         Phase(goal=pull, gripper=1.0, lost=lost),

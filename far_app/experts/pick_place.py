@@ -21,49 +21,53 @@ HALF = (0.195, 0.245)
 HAND = (0.04, 0.11)
 """Half of the hand's thickness and of its width, metres: what it needs of the room to the walls."""
 QUARTER = math.pi / 2
+CLEARLY = 0.02
+"""Metres of room for which the hand changes its mind."""
 DROP = 0.10
 """Metres above the bin's floor at which to let go."""
 
 
-class Ways:
-    """Which of the turns that take the object alike the hand makes: the smallest that no wall forbids. It keeps to its
-    choice until that becomes worse than another by HALT."""
+def shortage(room: tuple[float, float], yaw: float) -> float:
+    """Metres by which the hand at this yaw reaches into the walls; `room`: to the nearer ones, in x and in y."""
+    across, along = abs(math.sin(yaw)), abs(math.cos(yaw))
+    extent = (HAND[1] * across + HAND[0] * along, HAND[1] * along + HAND[0] * across)
+    return max(0.0, extent[0] - room[0], extent[1] - room[1])
 
-    HALT = 0.02
+
+class QuarterTurn:
+    """By which quarter turn the hand takes an object's sides: the smallest that the walls leave room for. It keeps to
+    its choice until another leaves clearly more room."""
 
     def __init__(self) -> None:
-        self.turn: float | None = None
+        self.chosen: float | None = None
 
-    def __call__(self, room: tuple[float, float], own: float, turns: tuple[float, ...]) -> float:
-        def short(turn: float) -> float:
-            """Metres that the nearer walls leave too little."""
-            across, along = abs(math.sin(own + turn)), abs(math.cos(own + turn))
-            extent = (HAND[1] * across + HAND[0] * along, HAND[1] * along + HAND[0] * across)
-            return max(0.0, *(needed - there for needed, there in zip(extent, room, strict=True)))
-
-        best = min(turns, key=lambda turn: (round(short(turn), 3), abs(own + turn)))
-        if self.turn is None or short(self.turn) > short(best) + self.HALT:
-            self.turn = best
-        return self.turn
+    def __call__(self, room: tuple[float, float], own: float) -> float:
+        """`own`: the object's yaw; returns the hand's."""
+        best = min((0.0, QUARTER, -QUARTER), key=lambda turn: (round(shortage(room, own + turn), 3), abs(own + turn)))
+        if self.chosen is None or shortage(room, own + self.chosen) > shortage(room, own + best) + CLEARLY:
+            self.chosen = best
+        return own + self.chosen
 
 
-def pick_place(hand: Hand, start: Pose, name: str, quarter: tuple[float, float], square: bool, top: float, up: float) -> Script:
+def pick_place(
+    hand: Hand, start: Pose, name: str, quarter: tuple[float, float], square: bool, top: float, grip: float = 0.0
+) -> Script:
     """`quarter`: from the second bin's middle to where to let go, metres; `square`: the object has sides;
-    `top`: how far above its middle to come and go, metres, `up`: to take it."""
+    `top`: how far above its middle the way to it leads, `grip`: how far above its middle to take it, metres."""
 
     def middle(observation: Observation) -> np.ndarray:
         return observation.objects[name].position
 
     def grasp(observation: Observation) -> np.ndarray:
-        return middle(observation) + (0.0, 0.0, up)
+        return middle(observation) + (0.0, 0.0, grip)
 
-    steady, ways = Steady(QUARTER), Ways()
+    steady, across = Steady(QUARTER), QuarterTurn()
 
     def yaw(observation: Observation) -> float:
         """Of the hand: across the object's sides, the way that the walls leave room for."""
         x, y, _ = middle(observation) - observation.objects["bin"].position - FIRST_BIN
         own = steady(yaw_of(observation.objects[name].quaternion)) if square else 0.0
-        return own + ways((HALF[0] - abs(x), HALF[1] - abs(y)), own, (0.0, QUARTER, -QUARTER))
+        return across((HALF[0] - abs(x), HALF[1] - abs(y)), own)
 
     def over(height: float):
         def goal(observation: Observation) -> Pose:
@@ -83,8 +87,8 @@ def pick_place(hand: Hand, start: Pose, name: str, quarter: tuple[float, float],
 
 
 def bread(hand: Hand, start: Pose) -> Script:
-    return pick_place(hand, start, "bread", (0.08, -0.10), square=True, top=0.05, up=0.008)
+    return pick_place(hand, start, "bread", (0.08, -0.10), square=True, top=0.05, grip=0.008)
 
 
 def can(hand: Hand, start: Pose) -> Script:
-    return pick_place(hand, start, "can", (0.06, 0.08), square=False, top=0.04, up=0.0)
+    return pick_place(hand, start, "can", (0.06, 0.08), square=False, top=0.04)

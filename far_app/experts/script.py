@@ -20,8 +20,6 @@ GAIN = 0.3
 """Share of the remaining distance asked for in 1/30 s; the arm answers with about three such ticks' delay."""
 DOWN = np.array((0.0, 0.0, 1.0))
 """The axis a downward hand is turned about."""
-
-
 SPIN = 1.0
 """Radians a second: the hand's turning is slow to follow, and one that lags behind swings."""
 
