@@ -26,10 +26,10 @@ class Held:
 
 def pick(
     hand: Hand, start: Pose, grasp: Callable[[Observation], np.ndarray], yaw: Callable[[Observation], float],
-    height: float, held: Held, top: float = 0.0,
+    height: float, held: Held, top: float = 0.0, close: float = 1.0,
 ) -> list[Phase]:  # fmt: skip
     """Phases until the object hangs `height` above where it lay; `grasp` and `yaw` say where and how to take it, `top`
-    how far the object reaches above the grasp (metres)."""
+    how far the object reaches above the grasp (metres), `close` how firmly to take it, in (0, 1]."""
     style = hand.style
 
     def at(observation: Observation, up: float) -> Pose:
@@ -57,8 +57,8 @@ def pick(
     return [
         Phase(goal=over, gripper=-1.0, near=0.012),
         Phase(goal=down, gripper=-1.0, near=0.008, patience=2.0, lost=strayed),
-        Phase(goal=down, gripper=1.0, done=Closed(), least=style.dwell, patience=2.0),
-        Phase(goal=up, gripper=1.0, near=0.02, turn=0.5, lost=slipped(grasp)),
+        Phase(goal=down, gripper=close, done=Closed(), least=style.dwell, patience=2.0),
+        Phase(goal=up, gripper=close, near=0.02, turn=0.5, lost=slipped(grasp)),
     ]
 
 

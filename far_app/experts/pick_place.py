@@ -23,6 +23,8 @@ HAND = (0.04, 0.11)
 QUARTER = math.pi / 2
 CLEARLY = 0.02
 """Metres of room for which the hand changes its mind."""
+GENTLY = 0.5
+"""Of a full closing: the bread is light and slips out of a firm hand."""
 DROP = 0.10
 """Metres above the bin's floor at which to let go."""
 
@@ -50,10 +52,12 @@ class QuarterTurn:
 
 
 def pick_place(
-    hand: Hand, start: Pose, name: str, quarter: tuple[float, float], square: bool, top: float, grip: float = 0.0
-) -> Script:
+    hand: Hand, start: Pose, name: str, quarter: tuple[float, float], square: bool, top: float,
+    grip: float = 0.0, close: float = 1.0,
+) -> Script:  # fmt: skip
     """`quarter`: from the second bin's middle to where to let go, metres; `square`: the object has sides;
-    `top`: how far above its middle the way to it leads, `grip`: how far above its middle to take it, metres."""
+    `top`: how far above its middle the way to it leads, `grip`: how far above its middle to take it, metres;
+    `close`: how firmly, in (0, 1]."""
 
     def middle(observation: Observation) -> np.ndarray:
         return observation.objects[name].position
@@ -61,7 +65,7 @@ def pick_place(
     def grasp(observation: Observation) -> np.ndarray:
         return middle(observation) + (0.0, 0.0, grip)
 
-    steady, across = Steady(QUARTER), QuarterTurn()
+    steady, across, held = Steady(QUARTER), QuarterTurn(), Held()
 
     def yaw(observation: Observation) -> float:
         """Of the hand: across the object's sides, the way that the walls leave room for."""
@@ -72,22 +76,22 @@ def pick_place(
     def over(height: float):
         def goal(observation: Observation) -> Pose:
             place = observation.objects["bin"].position + (*quarter, height)
-            return carried(observation, middle(observation), place, turned(start, 0.0))
+            return carried(observation, middle(observation), place, turned(start, held.yaw))
 
         return goal
 
     lost = slipped(middle)
     return Script(hand, [
-        *pick(hand, start, grasp, yaw, height=LIFT, held=Held(), top=top),
-        Phase(goal=over(CLEARANCE), gripper=1.0, near=0.03, turn=3.2, lost=lost),
-        Phase(goal=over(DROP), gripper=1.0, near=0.03, turn=3.2, patience=2.0, lost=lost),
+        *pick(hand, start, grasp, yaw, height=LIFT, held=held, top=top, close=close),
+        Phase(goal=over(CLEARANCE), gripper=close, near=0.03, turn=3.2, lost=lost),
+        Phase(goal=over(DROP), gripper=close, near=0.03, turn=3.2, patience=2.0, lost=lost),
         Phase(goal=lambda o: Pose(position=o.eef.position, quaternion=o.eef.quaternion), gripper=-1.0, dwell=0.5),
         Phase(goal=lambda o: Pose(position=o.eef.position + (0, 0, 0.05), quaternion=o.eef.quaternion), gripper=-1.0),
     ])  # fmt: skip
 
 
 def bread(hand: Hand, start: Pose) -> Script:
-    return pick_place(hand, start, "bread", (0.08, -0.10), square=True, top=0.05, grip=0.008)
+    return pick_place(hand, start, "bread", (0.08, -0.10), square=True, top=0.05, grip=0.008, close=GENTLY)
 
 
 def can(hand: Hand, start: Pose) -> Script:

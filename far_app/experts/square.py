@@ -12,8 +12,14 @@ ABOVE = 0.19
 """Metres above the table at which the nut passes over the peg's tip."""
 TIP = 0.13
 """Metres above the table, of the peg."""
+HANDLE = 0.054
+"""Metres from the nut's middle to its handle's."""
 HANDLE_SIDES = (np.pi / 2, np.pi, -np.pi / 2)
-"""Where the handle may point when the nut is over the peg, radians: the arm reaches no further."""
+"""Where the handle may point when the nut is over the peg, radians."""
+FURTHER = 0.005
+"""Metres by which the hand may then be further from the arm's base than the peg is."""
+RISE = 0.005
+"""Metres above the handle's middle at which it is taken: fingers that press on the table do not close."""
 OUTWARD = 0.010
 """Metres beyond the handle's middle at which it is taken: broad fingers would stand on the ring."""
 ALIGNED = 0.005
@@ -29,7 +35,7 @@ def square(hand: Hand, start: Pose) -> Script:
         """Where to take it."""
         middle = observation.objects["handle"].position
         outward = middle - observation.objects["nut"].position
-        return middle + OUTWARD * outward / np.linalg.norm(outward)
+        return middle + OUTWARD * outward / np.linalg.norm(outward) + (0.0, 0.0, RISE)
 
     def nut(observation: Observation) -> Pose:
         return observation.objects["nut"]
@@ -54,9 +60,17 @@ def square(hand: Hand, start: Pose) -> Script:
         return bool(nut(observation).position[2] < table(observation) + 0.03)
 
     def square_error(observation: Observation) -> float:
-        """From the nearest of the three orientations in which the handle does not point away from the arm."""
-        yaw, peg = (yaw_of(observation.objects[name].quaternion) for name in ("nut", "peg"))
-        return min((folded(yaw - peg - side, 2 * np.pi) for side in HANDLE_SIDES), key=abs)
+        """From the nearest orientation in which the arm reaches the handle."""
+        peg = observation.objects["peg"]
+        yaw, peg_yaw = yaw_of(nut(observation).quaternion), yaw_of(peg.quaternion)
+
+        def further(side: float) -> float:
+            way = np.array((np.cos(peg_yaw + side), np.sin(peg_yaw + side)))
+            at = peg.position[:2] + (HANDLE + OUTWARD) * way
+            return float(np.linalg.norm(at) - np.linalg.norm(peg.position[:2]))
+
+        reached = [side for side in HANDLE_SIDES if further(side) < FURTHER]
+        return min((folded(yaw - peg_yaw - side, 2 * np.pi) for side in reached), key=abs)
 
     lost = slipped(handle)
     return Script(hand, [
