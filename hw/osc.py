@@ -39,6 +39,7 @@ class OperationalSpace:
         limited = model.jnt_limited[joints].astype(bool)
         self._low = np.where(limited, model.jnt_range[joints, 0], -np.inf)
         self._high = np.where(limited, model.jnt_range[joints, 1], np.inf)
+        self.stopped: Bool[np.ndarray, "7"] = np.zeros(len(dofs), bool)
         self._jacobian = np.zeros((6, model.nv))
         self._mass = np.zeros((model.nv, model.nv))
 
@@ -60,7 +61,7 @@ class OperationalSpace:
         self.J = self._jacobian[:, self.dofs]  # (6, 7)
         self.M = self._mass[np.ix_(self.dofs, self.dofs)]  # (7, 7)
         self._derive()
-        stopped = self._stopped()
+        self.stopped = stopped = self._stopped()
         if stopped.any():
             self.J = np.where(stopped, 0.0, self.J)
             self.M = np.where(np.outer(~stopped, ~stopped), self.M, np.diag(np.diag(self.M)))
@@ -97,5 +98,6 @@ class OperationalSpace:
         """τ for the coming physics step."""
         velocity = self.data.qvel[self.dofs]
         wrench = self.kp * self._error() - self.kd * (self.J @ velocity)
-        posture = self.kn * (self.posture - self.data.qpos[self.qpos]) - self.kdn * velocity
+        away = np.where(self.stopped, 0.0, self.posture - self.data.qpos[self.qpos])
+        posture = self.kn * away - self.kdn * velocity
         return self.gain @ wrench + self.nullspace @ posture + self.data.qfrc_bias[self.dofs]

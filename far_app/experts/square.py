@@ -29,7 +29,7 @@ THREADED = 0.012
 
 
 def square(hand: Hand, start: Pose) -> Script:
-    steady = Steady(np.pi)
+    steady, flips = Steady(np.pi), list[float]()
 
     def handle(observation: Observation) -> np.ndarray:
         """Where to take it."""
@@ -41,7 +41,12 @@ def square(hand: Hand, start: Pose) -> Script:
         return observation.objects["nut"]
 
     def across(observation: Observation) -> float:
-        return steady(yaw_of(nut(observation).quaternion))
+        """Either way round, whichever leaves the hand less turned both here and over the peg."""
+        yaw = steady(yaw_of(nut(observation).quaternion))
+        if not flips:
+            error = square_error(observation)
+            flips.append(min((0.0, np.pi, -np.pi), key=lambda f: max(abs(yaw + f), abs(yaw + f - error))))
+        return yaw + flips[0]
 
     def over_peg(observation: Observation, up: float = ABOVE) -> Pose:
         peg = observation.objects["peg"].position
