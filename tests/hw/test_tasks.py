@@ -16,6 +16,7 @@ from far_app.types import ACTION_DIM, RobotMode
 from hw.lockstep import LockstepRobot
 from hw.rig import load_rig
 from hw.twin import TwinPlant
+from hw.twin_arms import ARMS
 from hw.twin_view import TwinView
 
 PANDA = load_rig("panda")
@@ -101,6 +102,7 @@ def test_an_arm_that_reached_for_a_far_corner_still_gets_home(rig_name, name):
             action[:3] = np.clip((np.array(corner) - eef.position) / robot.scale.translation, -1.0, 1.0)
             robot.send(integrator.target(action, eef, robot.now))
             robot.advance()
+            assert robot.observe().joints[3] < ARMS[rig.arm].elbow_stop + 0.05, "the elbow bends the other way"
         go_home(robot)
 
 
