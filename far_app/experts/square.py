@@ -20,7 +20,7 @@ FURTHER = 0.005
 """Metres by which the hand may then be further from the arm's base than the peg is."""
 RISE = 0.005
 """Metres above the handle's middle at which it is taken: fingers that press on the table do not close."""
-OUTWARD = 0.010
+OUTWARD = 0.014
 """Metres beyond the handle's middle at which it is taken: broad fingers would stand on the ring."""
 ALIGNED = 0.005
 """Metres beside the peg with which the nut may begin to go down."""
