@@ -206,3 +206,5 @@ class TaskConfig:
     retreat: tuple[float, float, float] = (0.0, 0.0, 0.10)
     """Retreat before the path home, metres, base frame."""
     cameras: tuple[str, ...] = ("front", "wrist")
+    front: tuple[tuple[float, float, float], tuple[float, float, float]] = ((0.62, 0.0, 1.42), (-0.03, 0.0, 0.93))
+    """Where the twin's front camera stands and what it looks at, metres, in the twin's world."""

@@ -11,6 +11,8 @@ from dataclasses import replace
 from far_app.config import Arm, TaskConfig
 from far_app.errors import ConfigError
 
+BINS = ((0.92, 0.02, 1.62), (0.02, 0.02, 0.88))
+"""Both bins and the hand between them, from the front."""
 PANDA_HZ = 20.0
 """Control steps a second of the paper's simulation."""
 XARM_HZ = 30.0
@@ -25,15 +27,16 @@ TASKS: dict[str, TaskConfig] = {
     ),
     "door": TaskConfig(
         name="door", environment="Door", horizon=200, repeat=3,
-        objects=(("handle", "Door_handle"), ("door", "Door_door")),
+        objects=(("handle", "Door_handle"), ("door", "Door_door")), retreat=(0.0, 0.10, 0.0),
+        front=((0.40, 0.62, 1.52), (-0.20, -0.15, 1.06)),
     ),
     "bread": TaskConfig(
         name="bread", environment="PickPlaceBread", horizon=200, repeat=3,
-        objects=(("bread", "Bread_main"), ("bin", "bin2")),
+        objects=(("bread", "Bread_main"), ("bin", "bin2")), front=BINS,
     ),
     "can": TaskConfig(
         name="can", environment="PickPlaceCan", horizon=200,
-        objects=(("can", "Can_main"), ("bin", "bin2")),
+        objects=(("can", "Can_main"), ("bin", "bin2")), front=BINS,
     ),
     "square": TaskConfig(
         name="square", environment="NutAssemblySquare", horizon=200,

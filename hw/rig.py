@@ -1,10 +1,15 @@
-"""One rig, one TOML file: limits, start pose, action scale, cameras."""
+"""One rig, one TOML file: limits, start pose, action scale, cameras; what differs at a task's station in its own table.
+
+[station.can]               # for the task `can` this is laid over the file's own settings, key by key
+base = [-0.28, -0.08, 0.912]
+"""
 
 from __future__ import annotations
 
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from far_app.config import Arm, TaskConfig, from_table
 from far_app.errors import ConfigError
@@ -70,6 +75,8 @@ class RigConfig:
     safety: SafetyLimits
     start_joints: tuple[float, ...] = ()
     """The start pose in joint space, radians (twin: where a scene reset puts the arm)."""
+    base: tuple[float, ...] = ()
+    """Where the twin's arm stands in its world, metres; where robosuite puts it when empty."""
     scale: ActionScale = field(default_factory=ActionScale)
     home: HomePath = field(default_factory=HomePath)
     watchdog: float = 0.1
@@ -86,8 +93,8 @@ class RigConfig:
         return self.scale.repeated(task.repeat)
 
 
-def load_rig(name_or_path: str) -> RigConfig:
-    """A rig by name (hw/rigs/NAME.toml) or by path."""
+def load_rig(name_or_path: str, task: str = "") -> RigConfig:
+    """A rig by name (hw/rigs/NAME.toml) or by path, at the station of a task when it has one of its own."""
     path = Path(name_or_path)
     if path.suffix != ".toml":
         path = RIGS / f"{name_or_path}.toml"
@@ -98,4 +105,13 @@ def load_rig(name_or_path: str) -> RigConfig:
         table = tomllib.loads(path.read_text())
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"rig file {path} is not valid TOML: {error}") from error
-    return from_table(RigConfig, table, path.name)
+    station = table.pop("station", {}).get(task, {})
+    return from_table(RigConfig, laid_over(table, station), path.name)
+
+
+def laid_over(table: dict[str, Any], station: dict[str, Any]) -> dict[str, Any]:
+    """The file's settings with a station's in their place, table by table."""
+    both = dict(table)
+    for key, value in station.items():
+        both[key] = laid_over(table[key], value) if isinstance(value, dict) and key in table else value
+    return both

@@ -144,7 +144,7 @@ def serve(
         )
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        rig = load_rig(rig_name)
+        rig = load_rig(rig_name, task_name)
         task = task_named(task_name, rig.arm)
         server = Server(rig, task, Endpoints.in_folder(folder))
         server.start()

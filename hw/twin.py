@@ -24,7 +24,7 @@ from hw.osc import OperationalSpace
 from hw.plant import Measured
 from hw.rig import RigConfig
 from hw.twin_arms import ARMS
-from hw.twin_view import FRONT, CameraPlacement
+from hw.twin_view import CameraPlacement
 
 SERVO_HZ = 120
 SUBSTEPS = 4
@@ -103,17 +103,22 @@ class TwinPlant:
         self.model = self.env.sim.model._model
         self.data = self.env.sim.data._data
         self.model.opt.timestep = 1.0 / (SERVO_HZ * SUBSTEPS)
+        self.model.joint("robot0_joint4").range[1] = self.arm.elbow_stop
         self.robot = self.env.robots[0]
         arm = self.robot.arms[0]
         self._site = self.robot.eef_site_id[arm]
         self._arm_qpos = np.asarray(self.robot._ref_joint_pos_indexes[:7])
-        self._finger_qpos = self.model.joint(self.arm.finger_joint).qposadr[0]
+        self._finger_qpos = np.array([self.model.joint(name).qposadr[0] for name, _, _ in self.arm.finger_joints])
+        self._shut, self._wide = np.array([(shut, wide) for _, shut, wide in self.arm.finger_joints]).T
         self._arm_actuators = np.array([self.model.actuator(f"robot0_torq_j{i}").id for i in range(1, 8)])
         dofs = np.array([self.model.joint(f"robot0_joint{i}").dofadr[0] for i in range(1, 8)])
         mujoco.mj_forward(self.model, self.data)
         self.osc = OperationalSpace(self.model, self.data, self._site, dofs, self._arm_qpos, STIFFNESS)
         self._fingers = [(self.model.actuator(name).id, opens) for name, opens in self.arm.fingers]
         base = self.model.body("robot0_base").id
+        if self.rig.base:
+            self.model.body_pos[base] = self.rig.base
+            mujoco.mj_forward(self.model, self.data)
         self._base_position = self.data.xpos[base].copy()
         self._base_quaternion = quat_wxyz_to_xyzw(self.data.xquat[base])
         self._objects = {name: self._place_of(element) for name, element in self.task.objects}
@@ -157,11 +162,11 @@ class TwinPlant:
     def measure(self) -> Measured:
         objects = {name: self._pose(*place) for name, place in self._objects.items()}
         success, reward = self._task_check
-        shut, wide = self.arm.finger_closed, self.arm.finger_open
+        opening = (self.data.qpos[self._finger_qpos] - self._shut) / (self._wide - self._shut)
         return Measured(
             eef=self._pose(self.data.site_xpos[self._site], self.data.site_xmat[self._site]),
             joints=self.data.qpos[self._arm_qpos].copy(),
-            gripper=float(np.clip((self.data.qpos[self._finger_qpos] - shut) / (wide - shut), 0.0, 1.0)),
+            gripper=float(np.clip(opening.mean(), 0.0, 1.0)),
             objects=objects, success=success, reward=reward,
         )  # fmt: skip
 
@@ -203,7 +208,9 @@ class TwinPlant:
 
     def cameras(self) -> dict[str, CameraPlacement]:
         """Where the cameras are, by name."""
-        return {"front": FRONT, "wrist": self.arm.wrist}
+        position, target = self.task.front
+        front = CameraPlacement(position=position, target=target, up=(0, 0, 1), fovy=48.0)
+        return {"front": front, "wrist": self.arm.wrist}
 
     def base_pose(self) -> Pose:
         """The arm's base in the world."""

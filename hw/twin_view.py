@@ -24,6 +24,8 @@ from far_app.types import Pose
 
 FACE_BUDGET = 400
 """Faces kept of each visual mesh."""
+MUJOCO_S_OWN = ".msh"
+"""A format only MuJoCo reads (can, bread, milk): such meshes are small, and stay as they are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,9 +40,6 @@ class CameraPlacement:
     fovy: float
     """Vertical field of view, degrees."""
     body: str = "world"
-
-
-FRONT = CameraPlacement(position=(0.62, 0.0, 1.42), target=(-0.03, 0.0, 0.93), up=(0, 0, 1), fovy=48.0)
 
 
 def look_at(camera: CameraPlacement) -> Float[np.ndarray, "4"]:
@@ -60,7 +59,7 @@ def thin_meshes(spec: mujoco.MjSpec, budget: int = FACE_BUDGET) -> None:
     import trimesh
 
     for mesh in spec.meshes:
-        if not mesh.file:
+        if not mesh.file or mesh.file.endswith(MUJOCO_S_OWN):
             continue
         shape: Any = trimesh.load(mesh.file, force="mesh", process=True)
         shape.merge_vertices(merge_tex=True, merge_norm=True)

@@ -51,7 +51,7 @@ class DemoOptions:
 
 def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(DemoOptions, args=list(arguments), prog="far demo")
-    rig = load_rig(options.rig)
+    rig = load_rig(options.rig, options.task)
     task = find_task(options.task, rig.arm)
     path = options.out or Path("datasets") / f"{task.name}.hdf5"
     env_args = origin(task, rig)

@@ -33,7 +33,7 @@ def lockstep_twins(rig_name: str, task: TaskConfig, count: int, images: bool = T
     from hw.twin import TwinPlant
     from hw.twin_view import TwinView
 
-    rig = load_rig(rig_name)
+    rig = load_rig(rig_name, task.name)
     plants = [TwinPlant(rig, task) for _ in range(count)]
     view = TwinView(plants[0].model_xml(), plants[0].base_pose(), plants[0].cameras()) if images else None
     return [LockstepRobot(plant, view, rig, task) for plant in plants]

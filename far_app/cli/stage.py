@@ -100,7 +100,7 @@ class Stage:
 @contextlib.contextmanager
 def stage(options: RunOptions) -> Iterator[Stage]:
     """Start everything, wait until it is ready, end everything. Raises the FarError of whatever cannot start."""
-    rig = load_rig(options.rig)
+    rig = load_rig(options.rig, options.task)
     task = find_task(options.task, rig.arm)
     port = 0 if options.headless else choose_port(options.host, options.port)
     with run_folder() as folder, contextlib.ExitStack() as stack:

@@ -6,16 +6,20 @@ import math
 
 import numpy as np
 
-from far_app.experts.script import Hand, Phase, Script, turned, yaw_of
+from far_app.experts.script import DOWN, Hand, Phase, Script, turned, yaw_of
 from far_app.motion import quat_from_rotvec, quat_inverse, quat_multiply, rotation_between
 from far_app.types import Observation, Pose
 
-PRESSED = 0.9
+PRESSED = 1.4
 """Radians the lever is turned before the door is pulled."""
 AHEAD = 0.04
 """Metres beyond the lever at which the hand aims while it turns or pulls."""
 TURN_AHEAD = 0.15
 """Radians, the same."""
+IN_LINE = 0.006
+"""Metres beside the lever's line within which the hand may go on to it; beyond that it keeps FUNNEL times its error
+away."""
+FUNNEL = 6.0
 SLIPPED = 0.07
 """Metres between hand and lever from which it is no longer in the hand."""
 EMPTY = 0.2
@@ -43,16 +47,31 @@ def door(hand: Hand, start: Pose) -> Script:
     def before(observation: Observation) -> Pose:
         return at(observation, (0.05 + style.hover) * normal(observation))
 
+    def onto(observation: Observation) -> Pose:
+        """Straight on to the lever; no nearer than the hand is in line with it."""
+        offset, outward = observation.eef.position - lever(observation) - style.offset, normal(observation)
+        beside = float(np.linalg.norm(offset - (offset @ outward) * outward))
+        return at(observation, FUNNEL * max(0.0, beside - IN_LINE) * outward)
+
     def there(observation: Observation) -> Pose:
         return at(observation, np.zeros(3))
 
+    def around(observation: Observation) -> bool:
+        """The lever is between the fingers."""
+        return bool(np.linalg.norm(there(observation).position - observation.eef.position) < 0.012)
+
+    def onward(observation: Observation) -> np.ndarray:
+        """The way the lever's end goes as it turns: down, then ever more to the side."""
+        angle, side = turned_down(observation), np.cross(normal(observation), DOWN)
+        return math.sin(angle) * side - math.cos(angle) * DOWN
+
     def turn(observation: Observation) -> Pose:
-        return at(observation, np.array((0.0, 0.0, -AHEAD)), TURN_AHEAD)
+        return at(observation, AHEAD * onward(observation), TURN_AHEAD)
 
     def pull(observation: Observation) -> Pose:
         if observation.success:
             return observation.eef
-        return at(observation, 0.6 * AHEAD * normal(observation))
+        return at(observation, 0.6 * AHEAD * normal(observation), TURN_AHEAD)
 
     def lost(observation: Observation) -> bool:
         away = np.linalg.norm(lever(observation) - observation.eef.position) > SLIPPED
@@ -60,7 +79,7 @@ def door(hand: Hand, start: Pose) -> Script:
 
     return Script(hand, [
         Phase(goal=before, gripper=-1.0, near=0.012, turn=0.08),
-        Phase(goal=there, gripper=-1.0, near=0.012, patience=3.0),
+        Phase(goal=onto, gripper=-1.0, pace=0.7, done=around, patience=3.0),
         Phase(goal=there, gripper=1.0, near=0.03, turn=0.3, dwell=style.dwell, patience=1.0),
         Phase(goal=turn, gripper=1.0, done=lambda o: turned_down(o) > PRESSED, patience=4.0, lost=lost),
         Phase(goal=pull, gripper=1.0, lost=lost),

@@ -26,10 +26,10 @@ class Held:
 
 def pick(
     hand: Hand, start: Pose, grasp: Callable[[Observation], np.ndarray], yaw: Callable[[Observation], float],
-    height: float, held: Held, top: float = 0.0,
+    height: float, held: Held, top: float = 0.0, close: float = 1.0,
 ) -> list[Phase]:  # fmt: skip
     """Phases until the object hangs `height` above where it lay; `grasp` and `yaw` say where and how to take it, `top`
-    how far the object reaches above the grasp (metres)."""
+    how far the object reaches above the grasp (metres), `close` how firmly to take it, in (0, 1]."""
     style = hand.style
 
     def at(observation: Observation, up: float) -> Pose:
@@ -57,9 +57,20 @@ def pick(
     return [
         Phase(goal=over, gripper=-1.0, near=0.012),
         Phase(goal=down, gripper=-1.0, near=0.008, patience=2.0, lost=strayed),
-        Phase(goal=down, gripper=1.0, near=0.02, turn=0.3, dwell=style.dwell, patience=1.0),
-        Phase(goal=up, gripper=1.0, near=0.02, turn=0.5, lost=slipped(grasp)),
+        Phase(goal=down, gripper=close, done=Closed(), least=style.dwell, patience=2.0),
+        Phase(goal=up, gripper=close, near=0.02, turn=0.5, lost=slipped(grasp)),
     ]
+
+
+class Closed:
+    """Whether the fingers have come to rest on something (or on each other)."""
+
+    def __init__(self) -> None:
+        self.before = 1.0
+
+    def __call__(self, observation: Observation) -> bool:
+        moved, self.before = self.before - observation.gripper, observation.gripper
+        return observation.gripper < 0.97 and abs(moved) < 0.02
 
 
 def slipped(grasp: Callable[[Observation], np.ndarray]) -> Callable[[Observation], bool]:

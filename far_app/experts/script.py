@@ -20,6 +20,8 @@ GAIN = 0.3
 """Share of the remaining distance asked for in 1/30 s; the arm answers with about three such ticks' delay."""
 DOWN = np.array((0.0, 0.0, 1.0))
 """The axis a downward hand is turned about."""
+SPIN = 1.0
+"""Radians a second: the hand's turning is slow to follow, and one that lags behind swings."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,14 +58,18 @@ class Hand:
         self.rate = task.rate
         self.gain = 1.0 - (1.0 - GAIN) ** (30.0 / task.rate)
 
-    def toward(self, observation: Observation, goal: Pose, gripper: float) -> Float[np.ndarray, "A"]:
-        """A step toward a pose, limited in speed, with the style's noise on the arm."""
-        style = self.style
+    def toward(
+        self, observation: Observation, goal: Pose, gripper: float, pace: float = 1.0, spin: float = math.inf
+    ) -> Float[np.ndarray, "A"]:
+        """A step toward a pose, limited to `pace` of the style's speed and to `spin` (radians a second), with the
+        style's noise on the arm."""
+        style, speed = self.style, pace * self.style.speed
+        turn_speed = min(speed, spin / (self.scale.rotation * self.rate))
         action = np.empty(ACTION_DIM)
         move = self.gain * (goal.position - observation.eef.position) / self.scale.translation
         turn = self.gain * rotation_between(observation.eef.quaternion, goal.quaternion) / self.scale.rotation
-        action[:3] = move * min(1.0, style.speed / max(1e-9, float(np.abs(move).max())))
-        action[3:6] = np.clip(turn, -style.speed, style.speed)
+        action[:3] = move * min(1.0, speed / max(1e-9, float(np.abs(move).max())))
+        action[3:6] = np.clip(turn, -turn_speed, turn_speed)
         action[:6] += self.rng.normal(0.0, style.noise, 6) * np.array((1, 1, 1, 0.5, 0.5, 0.5))
         action[6] = gripper
         return np.clip(action, -1.0, 1.0)
@@ -81,8 +87,12 @@ class Phase:
     """Radians."""
     dwell: float = 0.0
     """Seconds to stay once there."""
+    least: float = 0.0
+    """Seconds the phase lasts at least."""
     done: Callable[[Observation], bool] | None = None
     """What counts as there, in place of being near the goal."""
+    pace: float = 1.0
+    """Share of the style's speed: less where haste would throw or miss something."""
     patience: float = math.inf
     """Seconds after which the next phase begins anyway."""
     lost: Callable[[Observation], bool] = lambda observation: False
@@ -104,7 +114,7 @@ class Script:
             self._begin(self.index + 1)
         phase = self.phases[self.index]
         self.ticks += 1
-        return self.hand.toward(observation, phase.goal(observation), phase.gripper)
+        return self.hand.toward(observation, phase.goal(observation), phase.gripper, phase.pace, SPIN)
 
     def _begin(self, index: int) -> None:
         self.index, self.ticks, self.held = index, 0, 0
@@ -116,10 +126,10 @@ class Script:
             goal, eef = phase.goal(observation), observation.eef
             near = np.linalg.norm(goal.position - eef.position) < phase.near
             there = bool(near and np.linalg.norm(rotation_between(eef.quaternion, goal.quaternion)) < phase.turn)
-        self.held += there
+        self.held = self.held + 1 if there else 0
         if self.ticks >= phase.patience * self.hand.rate:
             return True
-        return there and self.held >= phase.dwell * self.hand.rate
+        return there and self.held >= phase.dwell * self.hand.rate and self.ticks >= phase.least * self.hand.rate
 
 
 def yaw_of(quaternion: Float[np.ndarray, "4"]) -> float:

@@ -11,7 +11,7 @@ from hw.lockstep import LockstepRobot
 from hw.rig import load_rig
 from hw.twin import SERVO_HZ, TwinPlant
 from hw.twin_arms import ARMS
-from hw.twin_view import FRONT, TwinView, look_at
+from hw.twin_view import TwinView, look_at
 
 RIG, TASK = load_rig("twin"), task("lift")
 
@@ -136,10 +136,10 @@ def test_geometry_belongs_to_bodies_that_have_poses(plant, view):
     assert poses[cube, :3] == pytest.approx(plant.measure().objects["cube"].position, abs=1e-6)
 
 
-def test_cameras_look_at_their_targets():
+def test_cameras_look_at_their_targets(plant):
     import mujoco
 
-    for camera in (FRONT, *(arm.wrist for arm in ARMS.values())):
+    for camera in (plant.cameras()["front"], *(arm.wrist for arm in ARMS.values())):
         matrix = np.empty(9)
         mujoco.mju_quat2Mat(matrix, look_at(camera))
         forward = -matrix.reshape(3, 3)[:, 2]
