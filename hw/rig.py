@@ -6,8 +6,9 @@ base = [-0.28, -0.08, 0.912]
 
 from __future__ import annotations
 
+import math
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +39,17 @@ class SafetyLimits:
     """Metres a second²."""
     rotation_acceleration: float = 70.0
     """Radians a second²."""
+    turn: float = math.pi
+    """Largest rotation of a target away from the start pose's orientation, radians. Wound up further than half a turn,
+    the hand would take the short way home, into a joint's end."""
+    upright: tuple[float, float, float, float] | None = None
+    """The start pose's orientation (xyzw, base frame); a rig fills it in."""
 
     def __post_init__(self) -> None:
         if any(low >= high for low, high in zip(self.box_min, self.box_max, strict=True)):
             raise ConfigError(f"safety box_min {self.box_min} must lie below box_max {self.box_max} on every axis")
+        if not 0 < self.turn <= math.pi:
+            raise ConfigError(f"safety turn is {self.turn}, must be above 0 and at most π radians")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +114,8 @@ def load_rig(name_or_path: str, task: str = "") -> RigConfig:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"rig file {path} is not valid TOML: {error}") from error
     station = table.pop("station", {}).get(task, {})
-    return from_table(RigConfig, laid_over(table, station), path.name)
+    rig = from_table(RigConfig, laid_over(table, station), path.name)
+    return replace(rig, safety=replace(rig.safety, upright=rig.start_quaternion))
 
 
 def laid_over(table: dict[str, Any], station: dict[str, Any]) -> dict[str, Any]:

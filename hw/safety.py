@@ -130,7 +130,8 @@ def _admit(state: SafetyState, target: Target, limits: SafetyLimits) -> Verdict:
         quaternion = state.pose.quaternion
     else:
         ahead = float(np.linalg.norm(rotation_between(state.pose.quaternion, state.goal.quaternion)))
-        quaternion = near_turn(state.pose.quaternion, turned, max(ahead, REACH * limits.step_rotation))
+        quaternion = turned if limits.upright is None else near_turn(np.array(limits.upright), turned, limits.turn)
+        quaternion = near_turn(state.pose.quaternion, quaternion, max(ahead, REACH * limits.step_rotation))
         quaternion = near_turn(state.goal.quaternion, quaternion, limits.step_rotation)
     goal = Pose(position=position, quaternion=quaternion)
     clipped = (

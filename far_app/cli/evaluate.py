@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +32,8 @@ from far_app.tasks import task as find_task
 from far_app.types import Trial
 from far_app.workers import Block, Workers, local_workers
 from hw.rig import load_rig
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,13 +88,19 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def run_plan(folder: Path, plan: EvaluationPlan, workers: int, run: Workers = local_workers) -> None:
-    total = plan.scenes * len(plan.arms)
-    with tqdm(total=total, unit="episode") as bar:
+    """What is missing, with a progress bar; says how fast it went."""
+    began, ticks = time.monotonic(), 0
+    with tqdm(total=plan.scenes * len(plan.arms), unit="episode") as bar:
 
         def count(record: dict[str, Any]) -> None:
+            nonlocal ticks
             bar.update()
+            ticks += 0 if record.get("shared") else sum(record["ticks"])
 
         evaluate(folder, plan, workers, count, begin, work, run)
+    seconds = time.monotonic() - began
+    if ticks:
+        log.info("%d policy ticks in %.0f s: %.0f a second, %d workers", ticks, seconds, ticks / seconds, workers)
 
 
 def summary(folder: Path, plan: EvaluationPlan) -> str:

@@ -285,3 +285,36 @@ def test_full_braking_from_full_speed_takes_less_than_50_ms() -> None:
         state = safety_filter(state, Brake(), LIMITS, 0.0).state
         periods += 1
     assert periods * PERIOD < 0.05
+
+
+def farthest_turn(seed: int, limits: SafetyLimits) -> float:
+    """How far a hand that begins within the limit is ever commanded away from upright, radians."""
+    rng = np.random.default_rng(seed)
+    upright = np.array((0.0, 1.0, 0.0, 0.0))
+    middle = (np.array(limits.box_min) + np.array(limits.box_max)) / 2
+    turn = random_turn(rng, 1.0)
+    begin = safety.near_turn(upright, quat_multiply(turn, upright), 1.5)
+    state = SafetyState.at_rest(Pose(position=middle, quaternion=begin), PERIOD, RAMP)
+    axis, farthest = rng.normal(size=3), 0.0
+    axis *= limits.step_rotation / np.linalg.norm(axis)
+    for i in range(60):
+        wish = quat_multiply(quat_from_rotvec(axis + rng.normal(size=3) * 0.02), state.goal.quaternion)
+        pose = Pose(position=middle, quaternion=wish)
+        target = Target(seq=i, pose=pose, gripper=0.0, created=0.0, expires=1.0)
+        state = safety_filter(state, target, limits, 0.0).state
+        for _ in range(RAMP):
+            state = safety_filter(state, Follow(), limits, 0.0).state
+        farthest = max(farthest, *(float(np.linalg.norm(rotation_between(upright, q)))
+                                   for q in (state.goal.quaternion, state.pose.quaternion)))  # fmt: skip
+    return farthest
+
+
+@FAST
+@given(SEEDS)
+def test_the_hand_is_never_wound_up_further_than_the_turn_limit(seed):
+    limits = SafetyLimits(box_min=LIMITS.box_min, box_max=LIMITS.box_max, turn=1.5, upright=(0.0, 1.0, 0.0, 0.0))
+    assert farthest_turn(seed, limits) <= 1.5 + 0.05  # the servo may swing past its goal by a hair
+
+
+def test_without_the_turn_limit_it_is():
+    assert farthest_turn(0, LIMITS) > 1.6
