@@ -50,7 +50,8 @@ class AttributionConfig:
     rho: float = 10.0
     """ρ, per cent of the attempt's whole chunks (paper, hyperparameter table)."""
     threshold: float = float("nan")
-    """ΔV below which a chunk is flagged when rule is threshold; a percentile of the demonstrations' own ΔV."""
+    """ΔV below which a chunk is flagged when rule is threshold; where it is not given, the 5th percentile of the
+    demonstrations' own ΔV, as the critic's card tells it (the paper tells no threshold)."""
 
     def __post_init__(self) -> None:
         _check(0 < self.rho <= 100, "attribution.rho", self.rho, "in (0, 100]")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 UNTRAINED = "untrained:"
 """--policy untrained:PRESET gives random weights."""
+THRESHOLD_PERCENTILE = "5"
+"""Of the demonstrations' ΔV: attribution's threshold where its rule is one and none is given."""
 CHECKPOINTS = Path(__file__).parent.parent / "checkpoints"
 """The shipped quickstart model: {task}.policy.safetensors and {task}.critic.safetensors."""
 
@@ -87,6 +90,7 @@ def assemble(
         network, critic_network = trained(path, critic or beside, task.name, device, entry.needs_critic)
         if (retry.fcpa.guard == "bc" or entry.needs_demonstrations) and critic_network is not None:
             demonstrations = load_demonstrations(critic or beside, network)
+        retry = with_threshold(retry, critic or beside)
     base: dict[str, ActingPolicy] = {}
 
     def act(network: DiffusionPolicy, version: str, steering: Steering | None = None) -> ActingPolicy:
@@ -105,6 +109,19 @@ def assemble(
         method=make_method(method, ingredients), policy_name=name, max_attempts=entry.attempts,
         another=lambda: make_method(method, ingredients),
     )  # fmt: skip
+
+
+def with_threshold(retry: RetryConfig, critic: Path) -> RetryConfig:
+    """The settings with the model's own threshold of attribution, where the rule wants one and none was given."""
+    from far_app.learning.critic_file import read_card
+
+    rule = retry.attribution
+    if rule.rule != "threshold" or not math.isnan(rule.threshold):
+        return retry
+    percentiles = read_card(critic).get("demonstration_value_change_percentiles")
+    if not isinstance(percentiles, dict) or THRESHOLD_PERCENTILE not in percentiles:
+        raise ConfigError(f"{critic} does not tell its demonstrations' ΔV; give --retry.attribution.threshold")
+    return replace(retry, attribution=replace(rule, threshold=float(percentiles[THRESHOLD_PERCENTILE])))
 
 
 def trained(

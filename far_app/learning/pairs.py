@@ -71,9 +71,7 @@ def candidates(
     return torch.cat(chunks).reshape(noise.shape)
 
 
-def explored(
-    chunks: Float[Tensor, "S M H A"], sigma: float, rng: np.random.Generator
-) -> Float[Tensor, "S M H A"]:
+def explored(chunks: Float[Tensor, "S M H A"], sigma: float, rng: np.random.Generator) -> Float[Tensor, "S M H A"]:
     """Every candidate moved by a translation of its own, the same at all its steps: a^(i) + δ, δ ~ N(0, σ²) in x, y, z.
     A state's first candidate stays the policy's own."""
     states, per_state = chunks.shape[:2]

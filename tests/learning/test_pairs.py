@@ -8,7 +8,17 @@ from hypothesis import strategies as st
 
 from far_app.config import PairsConfig
 from far_app.learning.cancellation import AdaptationCancelledError, never
-from far_app.learning.pairs import BATCH, candidates, distance, explored, merged, moderate, select, top_k, weighted_trajectory
+from far_app.learning.pairs import (
+    BATCH,
+    candidates,
+    distance,
+    explored,
+    merged,
+    moderate,
+    select,
+    top_k,
+    weighted_trajectory,
+)
 
 H, A = 3, 7
 
