@@ -47,6 +47,8 @@ class CriticOptions:
     first_scene: int = DEV_SCENES
     samples: int = 32
     """Chunks drawn in a state."""
+    explore: float = 0.0
+    """Move each chunk by a translation drawn with this σ, as pairs.explore does."""
     every: int = 10
     """Ticks between two states of an attempt."""
     json: Path | None = None
@@ -71,6 +73,7 @@ def measure(options: CriticOptions) -> dict[str, Any]:
     from far_app.cli.assemble import assemble, shipped, trained
     from far_app.cli.lockstep_twin import lockstep_twin
     from far_app.detectors import TwinCheck
+    from far_app.learning.pairs import explored
     from far_app.methods.evidence import history
     from far_app.seeding import generator
     from far_app.session.lockstep import adapt_at_once, run_lockstep
@@ -104,12 +107,12 @@ def measure(options: CriticOptions) -> dict[str, Any]:
             bar.update()
             for tick in reaching(attempt, options.every):
                 seen = [history(attempt, tick, network.config.n_obs)]
-                noise = generator("bench critic", attempt.scene_seed, tick).standard_normal(
-                    (options.samples, network.config.horizon, ACTION_DIM), dtype=np.float32
-                )
+                rng = generator("bench critic", attempt.scene_seed, tick)
+                noise = rng.standard_normal((options.samples, network.config.horizon, ACTION_DIM), dtype=np.float32)
                 with torch.no_grad():
                     features = network.encode(seen)
                     chunks = network.sample(features.expand(options.samples, -1), torch.from_numpy(noise))
+                    chunks = explored(chunks[None], options.explore, rng)[0]
                     scores = judge.q(judge.see(seen, features).expand(options.samples, -1), chunks)
                 ahead = robot.scale.translation * chunks[:, :, :3].clamp(-1, 1).sum(1).numpy()
                 states.append(Ranking.of(offset(attempt, tick), ahead, scores.numpy()))

@@ -159,6 +159,18 @@ def test_adaptations_accumulate_or_restart_with_all_pairs():
     assert again.history[0].winner_error != second.history[0].winner_error
 
 
+def test_candidates_that_explore_teach_another_lesson():
+    def lesson(explore: float):
+        m = made("fcpa", dataclasses.replace(QUICK, pairs=dataclasses.replace(QUICK.pairs, explore=explore)))
+        m.begin(5)
+        adapt(m)
+        (pairs,) = m.rounds
+        return pairs.positives.numpy().tobytes(), plan(m).tobytes()
+
+    assert all(there != here for there, here in zip(lesson(0.5), lesson(0.0), strict=True))
+    assert lesson(0.5) == lesson(0.5)
+
+
 def test_a_cancelled_adaptation_changes_nothing():
     m = made("far")
     m.begin(5)
