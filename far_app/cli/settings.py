@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar
 
 import tyro
 
-from far_app.cli.assemble import UNTRAINED, shipped
+from far_app.cli.assemble import CHECKPOINTS, UNTRAINED, shipped
 from far_app.config import RetryConfig, from_table
 from far_app.errors import ConfigError
 
@@ -33,6 +33,16 @@ def recommended(task: str, policy: str | Path | None) -> RetryConfig:
         return from_table(RetryConfig, tomllib.loads(path.read_text()), path.name)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path} is not valid TOML: {error}") from error
+
+
+def recommend(preset: str, checkpoint: Path) -> Path | None:
+    """Put what measured best for the preset beside a new checkpoint; None where nothing is known of the preset, or
+    something lies there already."""
+    known, beside = CHECKPOINTS / f"preset.{preset}.retry.toml", checkpoint.with_name("retry.toml")
+    if not known.exists() or beside.exists():
+        return None
+    beside.write_text(known.read_text())
+    return beside
 
 
 def parse(options: type[Options], arguments: Sequence[str], prog: str) -> Options:

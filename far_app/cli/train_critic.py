@@ -46,6 +46,7 @@ def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(TrainCriticOptions, args=list(arguments), prog="far train critic")
     import torch
 
+    from far_app.cli.settings import recommend
     from far_app.learning.dataset import read_episodes
     from far_app.learning.policy import load_policy
     from far_app.learning.train_critic import CriticTraining, train_critic
@@ -65,4 +66,6 @@ def main(arguments: Sequence[str]) -> int:
     card: dict[str, object] = {"command": "far train critic " + " ".join(arguments)}
     checkpoint = train_critic(demonstrations, attempts, policy, training, options.out or path.parent, card)
     log.info("wrote %s", checkpoint)
+    if (settings := recommend(policy.config.preset, path)) is not None:
+        log.info("wrote %s: settings of retrying that measured best for such policies", settings)
     return 0

@@ -1,9 +1,11 @@
 """What a checkpoint recommends is where a command begins; the command line has the last word."""
 
+from pathlib import Path
+
 import pytest
 
 from far_app.cli.options import RunOptions
-from far_app.cli.settings import parse, recommended
+from far_app.cli.settings import parse, recommend, recommended
 from far_app.config import FCPAConfig, RetryConfig
 from far_app.errors import ConfigError
 
@@ -37,3 +39,19 @@ def test_a_wrong_recommendation_is_named(tmp_path, text, says):
     (tmp_path / "retry.toml").write_text(text)
     with pytest.raises(ConfigError, match=says):
         recommended("lift", tmp_path / "policy.safetensors")
+
+
+@pytest.mark.parametrize("preset", ["state", "quickstart"])
+def test_a_new_checkpoint_gets_what_is_known_of_its_preset(tmp_path, preset):
+    checkpoint = tmp_path / "policy.safetensors"
+    assert recommend(preset, checkpoint) == tmp_path / "retry.toml"
+    assert recommended("lift", checkpoint).pairs.explore > 0
+
+
+def test_a_recommendation_that_is_there_already_stays(checkpoint):
+    assert recommend("state", Path(checkpoint)) is None
+    assert recommended("lift", checkpoint).fcpa.lr == 2e-6
+
+
+def test_nothing_is_recommended_for_a_preset_nobody_measured(tmp_path):
+    assert recommend("paper", tmp_path / "policy.safetensors") is None
