@@ -35,10 +35,10 @@ def recommended(task: str, policy: str | Path | None) -> RetryConfig:
         raise ConfigError(f"{path} is not valid TOML: {error}") from error
 
 
-def recommend(preset: str, checkpoint: Path) -> Path | None:
-    """Put what measured best for the preset beside a new checkpoint; None where nothing is known of the preset, or
-    something lies there already."""
-    known, beside = CHECKPOINTS / f"preset.{preset}.retry.toml", checkpoint.with_name("retry.toml")
+def recommend(task: str, preset: str, checkpoint: Path) -> Path | None:
+    """Put what measured best for such policies beside a new checkpoint; None where nothing is known of the task and
+    preset, or something lies there already."""
+    known, beside = CHECKPOINTS / f"{task}.{preset}.retry.toml", checkpoint.with_name("retry.toml")
     if not known.exists() or beside.exists():
         return None
     beside.write_text(known.read_text())

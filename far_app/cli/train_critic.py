@@ -66,6 +66,6 @@ def main(arguments: Sequence[str]) -> int:
     card: dict[str, object] = {"command": "far train critic " + " ".join(arguments)}
     checkpoint = train_critic(demonstrations, attempts, policy, training, options.out or path.parent, card)
     log.info("wrote %s", checkpoint)
-    if (settings := recommend(policy.config.preset, path)) is not None:
+    if (settings := recommend(options.task, policy.config.preset, path)) is not None:
         log.info("wrote %s: settings of retrying that measured best for such policies", settings)
     return 0

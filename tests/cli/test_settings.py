@@ -42,16 +42,17 @@ def test_a_wrong_recommendation_is_named(tmp_path, text, says):
 
 
 @pytest.mark.parametrize("preset", ["state", "quickstart"])
-def test_a_new_checkpoint_gets_what_is_known_of_its_preset(tmp_path, preset):
+def test_a_new_checkpoint_gets_what_is_known_of_such_policies(tmp_path, preset):
     checkpoint = tmp_path / "policy.safetensors"
-    assert recommend(preset, checkpoint) == tmp_path / "retry.toml"
+    assert recommend("lift", preset, checkpoint) == tmp_path / "retry.toml"
     assert recommended("lift", checkpoint).pairs.explore > 0
 
 
 def test_a_recommendation_that_is_there_already_stays(checkpoint):
-    assert recommend("state", Path(checkpoint)) is None
+    assert recommend("lift", "state", Path(checkpoint)) is None
     assert recommended("lift", checkpoint).fcpa.lr == 2e-6
 
 
-def test_nothing_is_recommended_for_a_preset_nobody_measured(tmp_path):
-    assert recommend("paper", tmp_path / "policy.safetensors") is None
+@pytest.mark.parametrize(("task", "preset"), [("lift", "paper"), ("can", "state")])
+def test_nothing_is_recommended_where_nothing_measured_best(tmp_path, task, preset):
+    assert recommend(task, preset, tmp_path / "policy.safetensors") is None
