@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -32,8 +31,6 @@ from far_app.tasks import task as find_task
 from far_app.types import Trial
 from far_app.workers import Block, Workers, local_workers
 from hw.rig import load_rig
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +97,7 @@ def run_plan(folder: Path, plan: EvaluationPlan, workers: int, run: Workers = lo
         evaluate(folder, plan, workers, count, begin, work, run)
     seconds = time.monotonic() - began
     if ticks:
-        log.info("%d policy ticks in %.0f s: %.0f a second, %d workers", ticks, seconds, ticks / seconds, workers)
+        print(f"{ticks} policy ticks in {seconds:.0f} s: {ticks / seconds:.0f} a second, workers: {workers}\n")
 
 
 def summary(folder: Path, plan: EvaluationPlan) -> str:
