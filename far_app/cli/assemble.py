@@ -90,7 +90,8 @@ def assemble(
         network, critic_network = trained(path, critic or beside, task.name, device, entry.needs_critic)
         if (retry.fcpa.guard == "bc" or entry.needs_demonstrations) and critic_network is not None:
             demonstrations = load_demonstrations(critic or beside, network)
-        retry = with_threshold(retry, critic or beside)
+        if critic_network is not None:
+            retry = with_threshold(retry, critic or beside)
     base: dict[str, ActingPolicy] = {}
 
     def act(network: DiffusionPolicy, version: str, steering: Steering | None = None) -> ActingPolicy:
