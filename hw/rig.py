@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 from far_app.config import Arm, TaskConfig, from_table
 from far_app.errors import ConfigError
 from far_app.motion import ActionScale
+from hw.camera_config import CameraConfig, cameras_from
 
 RIGS = Path(__file__).parent / "rigs"
 
@@ -95,6 +97,8 @@ class RigConfig:
     """Pixels, square."""
     operator_rate: float = 12.0
     """Operator pictures a second."""
+    cameras: Mapping[str, CameraConfig] = field(default_factory=dict)
+    """By view; the file's [camera.NAME] tables. Empty for a twin that draws its task's cameras."""
 
     def scale_for(self, task: TaskConfig) -> ActionScale:
         """What ±1 means in a tick of the task."""
@@ -114,8 +118,10 @@ def load_rig(name_or_path: str, task: str = "") -> RigConfig:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"rig file {path} is not valid TOML: {error}") from error
     station = table.pop("station", {}).get(task, {})
-    rig = from_table(RigConfig, laid_over(table, station), path.name)
-    return replace(rig, safety=replace(rig.safety, upright=rig.start_quaternion))
+    table = laid_over(table, station)
+    cameras = cameras_from(table.pop("camera", {}), path.name)
+    rig = from_table(RigConfig, table, path.name)
+    return replace(rig, cameras=cameras, safety=replace(rig.safety, upright=rig.start_quaternion))
 
 
 def laid_over(table: dict[str, Any], station: dict[str, Any]) -> dict[str, Any]:

@@ -35,9 +35,11 @@ from far_app.errors import ConfigError, FarError, RobotError
 from far_app.protocols import Hold
 from far_app.scheduling import PROMPT_NICENESS, SWITCH_INTERVAL, nice, prompt_context
 from far_app.tasks import task as task_named
+from hw.camera_config import with_views
 from hw.camera_thread import CameraThread
 from hw.command_thread import CommandThread
 from hw.controller import ArmController
+from hw.hardware_view import HardwareView
 from hw.picture_timing import PictureTiming
 from hw.plant import Plant, PlantView
 from hw.publisher_thread import PublisherThread
@@ -72,7 +74,8 @@ class Server:
 
     def __init__(self, rig: RigConfig, task: TaskConfig, endpoints: Endpoints) -> None:
         self.context = prompt_context()
-        self.plant, make_view = make_plant(rig, task)
+        self.plant, make_bodies = make_plant(rig, task)
+        make_view = (lambda: HardwareView(make_bodies(), rig.cameras)) if rig.cameras else make_bodies
         controller = ArmController(rig, task, self.plant.servo_hz, self.plant.measure())
         self.servo = ServoThread(self.plant, controller, camera_rate=task.rate)
         self.publisher = PublisherThread(self.servo, self.context, endpoints.observations, task.rate)
@@ -145,7 +148,7 @@ def serve(
     folder.mkdir(parents=True, exist_ok=True)
     try:
         rig = load_rig(rig_name, task_name)
-        task = task_named(task_name, rig.arm)
+        task = with_views(task_named(task_name, rig.arm), rig.cameras)
         server = Server(rig, task, Endpoints.in_folder(folder))
         server.start()
     except zmq.ZMQError as error:

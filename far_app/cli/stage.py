@@ -37,6 +37,7 @@ from far_app.session.recorder import Recorder
 from far_app.session.session import Session, SessionSettings
 from far_app.session.statistics import LoopStatistics
 from far_app.tasks import task as find_task
+from hw.camera_config import with_views
 from hw.rig import RigConfig, load_rig
 
 HARDWARE_PATIENCE = 180.0
@@ -101,7 +102,7 @@ class Stage:
 def stage(options: RunOptions) -> Iterator[Stage]:
     """Start everything, wait until it is ready, end everything. Raises the FarError of whatever cannot start."""
     rig = load_rig(options.rig, options.task)
-    task = find_task(options.task, rig.arm)
+    task = with_views(find_task(options.task, rig.arm), rig.cameras)
     port = 0 if options.headless else choose_port(options.host, options.port)
     with run_folder() as folder, contextlib.ExitStack() as stack:
         family = Family()
