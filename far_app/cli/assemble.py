@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -38,6 +38,8 @@ class Parts:
     """Attempts a trial where the method fixes them."""
     another: Callable[[], Method]
     """One more method of the same parts, for a trial beside; the base policy is shared, so that they plan together."""
+    card: Mapping[str, object] | None = None
+    """The policy's model card; None for a policy that no data made."""
 
 
 def shipped(task: str, kind: str) -> Path:
@@ -70,6 +72,7 @@ def assemble(
         return Parts(method=scripted, policy_name=policy, max_attempts=None, another=lambda: scripted)
 
     from far_app.learning.critic_file import load_demonstrations
+    from far_app.learning.policy import read_card as read_policy_card
     from far_app.learning.runtime import ActingPolicy
     from far_app.methods import METHODS, Ingredients
     from far_app.methods import method as make_method
@@ -79,7 +82,7 @@ def assemble(
         raise ConfigError(f"unknown method '{method}'; choose one of: {', '.join(METHODS)}")
     entry = METHODS[method]
     check_device(device)
-    demonstrations = None
+    demonstrations, card = None, None
     if policy is not None and policy.startswith(UNTRAINED):
         name = policy
         network, critic_network = untrained(policy.removeprefix(UNTRAINED), task.name, device)
@@ -88,6 +91,7 @@ def assemble(
         beside = shipped(task.name, "critic") if policy is None else path.with_name("critic.safetensors")
         name = f"shipped: {path.name}" if policy is None else str(path)
         network, critic_network = trained(path, critic or beside, task.name, device, entry.needs_critic)
+        card = read_policy_card(path)
         if (retry.fcpa.guard == "bc" or entry.needs_demonstrations) and critic_network is not None:
             demonstrations = load_demonstrations(critic or beside, network)
         if critic_network is not None:
@@ -108,7 +112,7 @@ def assemble(
     )
     return Parts(
         method=make_method(method, ingredients), policy_name=name, max_attempts=entry.attempts,
-        another=lambda: make_method(method, ingredients),
+        another=lambda: make_method(method, ingredients), card=card,
     )  # fmt: skip
 
 

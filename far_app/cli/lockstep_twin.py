@@ -14,6 +14,7 @@ from far_app.protocols import Method, Resume
 from far_app.types import Trial
 from hw.lockstep import LockstepRobot
 from hw.rig import RigConfig, load_rig
+from hw.setup import setup_of
 
 log = logging.getLogger(__name__)
 
@@ -40,10 +41,10 @@ def lockstep_twins(rig_name: str, task: TaskConfig, count: int, images: bool = T
 
 
 def origin(task: TaskConfig, rig: RigConfig) -> dict[str, object]:
-    """Where a dataset's episodes come from, as robomimic's env_args."""
+    """Where a dataset's episodes come from, as robomimic's env_args; `setup` is ours (far_app/preflight.py)."""
     return {
         "env_name": task.environment, "type": 1,
-        "env_kwargs": {"robots": rig.arm, "rig": dataclasses.asdict(rig)},
+        "env_kwargs": {"robots": rig.arm, "rig": dataclasses.asdict(rig)}, "setup": setup_of(rig, task).table(),
     }  # fmt: skip
 
 

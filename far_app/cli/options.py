@@ -54,6 +54,10 @@ class RunOptions:
     """Begin from what the checkpoint's makers recommend (the retry.toml beside it), or from the paper's settings."""
     retry: RetryConfig = field(default_factory=RetryConfig)
     """Settings of the method."""
+    shadow: bool = False
+    """The policy runs and its path is shown, with the arm held: nothing that moves it leaves the app."""
+    accept_differences: bool = False
+    """Go on though the rig differs from what the policy's data were made on; the preflight says in what."""
     verbose: bool = False
     """Log every phase change to the terminal."""
 

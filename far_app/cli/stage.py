@@ -19,6 +19,7 @@ from pathlib import Path
 from far_app.cli.assemble import Parts, assemble, check_observation
 from far_app.cli.options import RunOptions
 from far_app.cli.ports import choose_port
+from far_app.cli.preflight import preflight
 from far_app.cli.processes import Child, Family, run_folder
 from far_app.config import TaskConfig
 from far_app.detectors import TwinCheck
@@ -35,10 +36,12 @@ from far_app.session.publisher import TelemetryPublisher
 from far_app.session.realtime import prepare_process
 from far_app.session.recorder import Recorder
 from far_app.session.session import Session, SessionSettings
+from far_app.session.shadow import ShadowRobot
 from far_app.session.statistics import LoopStatistics
 from far_app.tasks import task as find_task
 from hw.camera_config import with_views
 from hw.rig import RigConfig, load_rig
+from hw.setup import setup_of
 
 HARDWARE_PATIENCE = 180.0
 """Seconds for the hw server's first observation (a first start compiles for a while)."""
@@ -84,15 +87,19 @@ class Stage:
             publisher = TelemetryPublisher(Endpoints.in_folder(self.folder).telemetry, statistics.health)
         try:
             with revived(self.family, self.page):
-                yield Session(
+                robot = ShadowRobot(self.robot) if options.shadow else self.robot
+                session = Session(
                     settings=SessionSettings(
                         name=writer.folder.name, trials=options.trials, seed=options.seed, headless=options.headless,
                         adaptation_limit=options.retry.adaptation_limit,
                     ),
-                    robot=self.robot, planner=ThreadedPlanner(), method=method or self.parts.method,
+                    robot=robot, planner=ThreadedPlanner(), method=method or self.parts.method,
                     detector=TwinCheck(self.task.success_ticks), task=self.task, scale=self.rig.scale_for(self.task),
                     recorder=Recorder(writer), inbox=inbox, statistics=statistics, publisher=publisher,
                 )  # fmt: skip
+                if options.shadow:
+                    session.supervision.say("shadow run: plans are shown, the arm is held", "warning")
+                yield session
         finally:
             if publisher is not None:
                 publisher.close()
@@ -112,7 +119,8 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         parts = assemble(
             options.method, task, options.policy, options.critic, options.device, options.retry, options.engine
         )
-        task = dataclasses.replace(task, max_attempts=options.max_attempts or parts.max_attempts or task.max_attempts)
+        attempts = options.max_attempts or parts.max_attempts or task.max_attempts
+        task = dataclasses.replace(task, max_attempts=1 if options.shadow else attempts)
         # From here on this process's threads come before the machine's others: one that is not scheduled while it holds
         # the interpreter would keep the loop waiting. The processes above were started before, at the usual priority.
         nice(PROMPT_NICENESS)
@@ -121,6 +129,7 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         if page is not None:
             wait_for_page(page, options.host, port)
         check_observation(parts.method.policy.spec, robot.observe())
+        preflight(parts, setup_of(rig, task), robot.observe(), options.accept_differences or options.shadow)
         prepare_process(options.torch_threads)
         warm_up(parts.method.policy, robot)
         yield Stage(
