@@ -198,6 +198,9 @@ class TaskConfig:
     """Consecutive ticks for which the twin's own check must hold."""
     max_attempts: int = 5
     """N (paper: 5 in simulation, 3 on the real arm)."""
+    judge: Literal["twin", "person"] = "twin"
+    """Who says that it succeeded where no learned detector does: the twin's own check, or a person (paper, Real-world
+    Experiments: by human inspection)."""
     rate: float = 30.0
     """Policy ticks a second."""
     placement: tuple[float, float] | None = None

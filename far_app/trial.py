@@ -23,7 +23,7 @@ import numpy as np
 from far_app.aggregation import Plan
 from far_app.config import TaskConfig
 from far_app.motion import ActionScale, TargetIntegrator
-from far_app.protocols import Heartbeat, Home, Method, Planner, PlanRequest, Reset, Robot, SuccessDetector
+from far_app.protocols import Heartbeat, Hold, Home, Method, Planner, PlanRequest, Reset, Robot, SuccessDetector
 from far_app.types import (
     ACTION_DIM,
     ActionChunk,
@@ -44,7 +44,7 @@ class Tick:
     monotonic clock in real time, simulated time in lockstep. By then the tick's target is to be with the arm."""
 
     phase: str
-    """"attempt" or "homing"."""
+    """"attempt", "judging" (the arm is held, the operator is asked) or "homing"."""
     attempt_index: int
     step: Step | None = None
     """The step that the last tick completed, with its acknowledged action and lateness."""
@@ -177,10 +177,30 @@ def execute(
             success=observation.success,
         )  # fmt: skip
 
+    if outcome is None and detector.patience > 0:
+        outcome = yield from wait_for_word(robot, detector, index)
     return Attempt(
         index=index, scene_seed=scene_seed, steps=tuple(steps), final=observation,
         outcome=outcome or Outcome(success=False, judged_by=Judge.HORIZON), policy_version=method.policy.version,
     )  # fmt: skip
+
+
+def wait_for_word(
+    robot: Robot, detector: SuccessDetector, index: int
+) -> Generator[Event, float | ActionChunk | None, Outcome | None]:
+    """The horizon is over and nobody has judged: hold the arm and ask the operator, for so long as the detector says.
+    None when no word came."""
+    robot.request(Hold(reason="waiting for the operator: success or failure?"))
+    began = now = yield Tick(phase="judging", attempt_index=index)
+    assert isinstance(began, float) and isinstance(now, float), "a Tick is answered with its deadline"
+    while now < began + detector.patience:
+        observation = robot.observe()
+        outcome = detector.judge(observation) or fault(observation)
+        if outcome is not None:
+            return outcome
+        now = yield Tick(phase="judging", attempt_index=index)
+        assert isinstance(now, float), "a Tick is answered with its deadline"
+    return None
 
 
 def go_home(

@@ -66,11 +66,17 @@ class CameraConfig:
         return {name: Framing(eye=self.eye, rotate=self.rotate, crop=self.crop)}
 
 
-def cameras_from(tables: Mapping[str, Any], where: str) -> dict[str, CameraConfig]:
-    """A rig file's [camera.NAME] tables."""
-    if not all(isinstance(table, dict) for table in tables.values()):
+def cameras_from(table: dict[str, Any], where: str) -> dict[str, CameraConfig] | None:
+    """Takes the cameras out of a rig file: its [camera.NAME] tables, {} for `cameras = []`, None for neither."""
+    none_on_purpose = table.get("cameras") == []
+    if none_on_purpose:
+        del table["cameras"]
+    tables = table.pop("camera", {} if none_on_purpose else None)
+    if tables is None:
+        return None
+    if not isinstance(tables, dict) or not all(isinstance(one, dict) for one in tables.values()):
         raise ConfigError(f"{where}.camera must hold a table for each camera, such as [camera.front]")
-    return {name: from_table(CameraConfig, table, f"{where}.camera.{name}") for name, table in tables.items()}
+    return {name: from_table(CameraConfig, one, f"{where}.camera.{name}") for name, one in tables.items()}
 
 
 def views_of(cameras: Mapping[str, CameraConfig]) -> dict[str, Framing]:
@@ -78,6 +84,6 @@ def views_of(cameras: Mapping[str, CameraConfig]) -> dict[str, Framing]:
     return {name: framing for camera, config in cameras.items() for name, framing in config.views(camera).items()}
 
 
-def with_views(task: TaskConfig, cameras: Mapping[str, CameraConfig]) -> TaskConfig:
-    """The task as this rig's cameras see it; a rig without cameras of its own (the twin) draws the task's."""
-    return replace(task, cameras=tuple(views_of(cameras))) if cameras else task
+def with_views(task: TaskConfig, cameras: Mapping[str, CameraConfig] | None) -> TaskConfig:
+    """The task as this rig's cameras see it; a rig that names none (the twin) has the task's own views."""
+    return task if cameras is None else replace(task, cameras=tuple(views_of(cameras)))

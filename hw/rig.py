@@ -97,8 +97,9 @@ class RigConfig:
     """Pixels, square."""
     operator_rate: float = 12.0
     """Operator pictures a second."""
-    cameras: Mapping[str, CameraConfig] = field(default_factory=dict)
-    """By view; the file's [camera.NAME] tables. Empty for a twin that draws its task's cameras."""
+    cameras: Mapping[str, CameraConfig] | None = None
+    """The file's [camera.NAME] tables; empty where it says cameras = [], none on purpose. None: the task's own views,
+    which the twin draws."""
 
     def scale_for(self, task: TaskConfig) -> ActionScale:
         """What ±1 means in a tick of the task."""
@@ -119,7 +120,7 @@ def load_rig(name_or_path: str, task: str = "") -> RigConfig:
         raise ConfigError(f"rig file {path} is not valid TOML: {error}") from error
     station = table.pop("station", {}).get(task, {})
     table = laid_over(table, station)
-    cameras = cameras_from(table.pop("camera", {}), path.name)
+    cameras = cameras_from(table, path.name)
     rig = from_table(RigConfig, table, path.name)
     return replace(rig, cameras=cameras, safety=replace(rig.safety, upright=rig.start_quaternion))
 

@@ -75,7 +75,8 @@ class Server:
     def __init__(self, rig: RigConfig, task: TaskConfig, endpoints: Endpoints) -> None:
         self.context = prompt_context()
         self.plant, make_bodies = make_plant(rig, task)
-        make_view = (lambda: HardwareView(make_bodies(), rig.cameras)) if rig.cameras else make_bodies
+        cameras = rig.cameras
+        make_view = (lambda: HardwareView(make_bodies(), cameras)) if cameras else make_bodies
         controller = ArmController(rig, task, self.plant.servo_hz, self.plant.measure())
         self.servo = ServoThread(self.plant, controller, camera_rate=task.rate)
         self.publisher = PublisherThread(self.servo, self.context, endpoints.observations, task.rate)

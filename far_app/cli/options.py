@@ -54,6 +54,8 @@ class RunOptions:
     """Begin from what the checkpoint's makers recommend (the retry.toml beside it), or from the paper's settings."""
     retry: RetryConfig = field(default_factory=RetryConfig)
     """Settings of the method."""
+    judge_wait: float = 30.0
+    """Seconds to wait for your word on an attempt that nobody could judge; then it is a failure. Headless: none."""
     shadow: bool = False
     """The policy runs and its path is shown, with the arm held: nothing that moves it leaves the app."""
     accept_differences: bool = False

@@ -22,11 +22,11 @@ from far_app.cli.ports import choose_port
 from far_app.cli.preflight import preflight
 from far_app.cli.processes import Child, Family, run_folder
 from far_app.config import TaskConfig
-from far_app.detectors import TwinCheck
+from far_app.detectors import PersonJudge, TwinCheck
 from far_app.endpoints import Endpoints
 from far_app.errors import FarError, RobotError
 from far_app.link import RemoteRobot
-from far_app.protocols import Method, PlanRequest, Policy
+from far_app.protocols import Method, PlanRequest, Policy, SuccessDetector
 from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
 from far_app.scheduling import PROMPT_NICENESS, nice
@@ -38,6 +38,7 @@ from far_app.session.recorder import Recorder
 from far_app.session.session import Session, SessionSettings
 from far_app.session.shadow import ShadowRobot
 from far_app.session.statistics import LoopStatistics
+from far_app.tasks import supervised
 from far_app.tasks import task as find_task
 from hw.camera_config import with_views
 from hw.rig import RigConfig, load_rig
@@ -74,6 +75,12 @@ class Stage:
             ),
         )  # fmt: skip
 
+    def detector(self) -> SuccessDetector:
+        """Who judges this stage's attempts, below the operator."""
+        if self.task.judge == "twin":
+            return TwinCheck(self.task.success_ticks)
+        return PersonJudge(0.0 if self.options.headless else self.options.judge_wait)
+
     @contextlib.contextmanager
     def session(
         self, writer: SessionWriter, inbox: IntentInbox, statistics: LoopStatistics, method: Method | None = None
@@ -94,7 +101,7 @@ class Stage:
                         adaptation_limit=options.retry.adaptation_limit,
                     ),
                     robot=robot, planner=ThreadedPlanner(), method=method or self.parts.method,
-                    detector=TwinCheck(self.task.success_ticks), task=self.task, scale=self.rig.scale_for(self.task),
+                    detector=self.detector(), task=self.task, scale=self.rig.scale_for(self.task),
                     recorder=Recorder(writer), inbox=inbox, statistics=statistics, publisher=publisher,
                 )  # fmt: skip
                 if options.shadow:
@@ -110,6 +117,7 @@ def stage(options: RunOptions) -> Iterator[Stage]:
     """Start everything, wait until it is ready, end everything. Raises the FarError of whatever cannot start."""
     rig = load_rig(options.rig, options.task)
     task = with_views(find_task(options.task, rig.arm), rig.cameras)
+    task = task if rig.robot == "twin" else supervised(task)
     port = 0 if options.headless else choose_port(options.host, options.port)
     with run_folder() as folder, contextlib.ExitStack() as stack:
         family = Family()

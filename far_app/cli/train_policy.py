@@ -80,7 +80,7 @@ def main(arguments: Sequence[str]) -> int:
     setup, framings = read_setup(data), None
     if options.rig is not None:
         rig = load_rig(options.rig, task.name)
-        framings = views_of(rig.cameras)
+        framings = views_of(rig.cameras or {})
         setup = setup_of(rig, with_views(find_task(task.name, rig.arm), rig.cameras)).table()
     episodes = read_episodes(data, config.cameras, options.demonstrations, config.image_size, framings)
     folder = options.out or Path("runs") / f"{task.name}-{options.preset}"

@@ -175,6 +175,9 @@ class Session:
         if tick.step is not None and tick.step.tick == self._recorded:
             self._record(tick.step)
         self._report()
+        if tick.phase == "judging" and not self.board.reason:
+            self.board.reason = f"success or failure? Say so within {self.detector.patience:g} s, or it is a failure"
+            self.supervision.say(self.board.reason)
         self.supervision.show()
         due = self.clock.wait()
         held = self.supervision.attend(tick.phase)

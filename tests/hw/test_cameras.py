@@ -12,10 +12,12 @@ import pytest
 from far_app.errors import ConfigError, RobotError
 from far_app.picture import seen
 from far_app.protocols import Camera
+from far_app.tasks import supervised
 from hw.camera_config import CameraConfig, views_of, with_views
 from hw.camera_reader import CameraReader
 from hw.capture import Shot, capture_for
 from hw.hardware_view import HardwareView
+from hw.rig import RIGS, load_rig
 from hw.synthetic_camera import SyntheticCapture, number_in, numbered
 from tests.hw.test_threads import TASK, BlindView
 
@@ -165,7 +167,7 @@ def test_both_eyes_are_two_views_of_one_device():
     cameras = {"zed": replace(CONFIG, eye="both"), "wrist": CameraConfig(device="synthetic", rate=100.0)}
     assert list(views_of(cameras)) == ["zed_left", "zed_right", "wrist"]
     assert with_views(TASK, cameras).cameras == ("zed_left", "zed_right", "wrist")
-    assert with_views(TASK, {}) is TASK
+    assert with_views(TASK, None) is TASK and with_views(TASK, {}).cameras == ()
     view = HardwareView(BlindView(good=9), cameras)
     assert len(view.readers) == 2
     frames = [view.camera(name, 84).frame() for name in views_of(cameras)]
@@ -215,3 +217,24 @@ def test_a_device_name_chooses_the_capture():
     assert type(capture_for("a", CONFIG)).__name__ == "SyntheticCapture"
     assert type(capture_for("a", replace(CONFIG, device="file:clip.avi"))).__name__ == "FileCapture"
     assert type(capture_for("a", replace(CONFIG, device="/dev/video0"))).__name__ == "DeviceCapture"
+
+
+def test_a_rig_file_names_its_cameras_says_that_it_has_none_or_leaves_them_to_the_task(tmp_path):
+    twin = (RIGS / "twin.toml").read_text()
+    path = tmp_path / "rig.toml"
+    for head, tail, expected in (("", "", None), ("cameras = []\n", "", {}), ("", '[camera.a]\ndevice = "x"', ["a"])):
+        path.write_text(f"{head}{twin}\n{tail}\n")
+        cameras = load_rig(str(path)).cameras
+        assert cameras == expected or (cameras is not None and list(cameras) == expected)
+    path.write_text(twin + '\n[camera.a]\ndevice = "x"\nlens = 3\n')
+    with pytest.raises(ConfigError, match="a: unknown setting lens"):
+        load_rig(str(path))
+
+
+def test_the_papers_rig_is_one_view_of_a_zed_minis_left_eye():
+    rig = load_rig("paper")
+    assert rig.cameras is not None and list(views_of(rig.cameras)) == ["front"]
+    camera = rig.cameras["front"]
+    assert (camera.width, camera.height, camera.rate, camera.eye) == (2560, 720, 60.0, "left")
+    entry = supervised(with_views(TASK, rig.cameras))
+    assert (entry.cameras, entry.max_attempts, entry.judge) == (("front",), 3, "person")
