@@ -46,8 +46,11 @@ class OperatorOverride:
 
     def __init__(self, detector: SuccessDetector) -> None:
         self.detector = detector
-        self.patience = detector.patience
         self._word: Outcome | None = None
+
+    @property
+    def patience(self) -> float:
+        return self.detector.patience
 
     def rule(self, outcome: Outcome) -> None:
         """The next judgement of this attempt is `outcome`; the first word stands."""

@@ -199,9 +199,11 @@ class Method(Protocol):
 class SuccessDetector(Protocol):
     """Says when an attempt is over."""
 
-    patience: float
-    """Seconds to wait for the operator's word, the arm held, when the horizon is over and nobody has said anything;
-    without one it is a failure. 0: it is a failure at once."""
+    @property
+    def patience(self) -> float:
+        """Seconds to wait for the operator's word, the arm held, when the horizon is over and nobody has said anything;
+        without one it is a failure. 0: it is a failure at once."""
+        ...
 
     def begin(self) -> None:
         """A new attempt."""

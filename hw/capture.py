@@ -43,7 +43,7 @@ class Capture(Protocol):
 
 def capture_for(name: str, config: CameraConfig) -> Capture:
     """The capture that a camera's `device` names."""
-    if config.device == SYNTHETIC:
+    if config.device.partition(":")[0] == SYNTHETIC:
         from hw.synthetic_camera import SyntheticCapture
 
         return SyntheticCapture(config)

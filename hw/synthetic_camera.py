@@ -1,11 +1,13 @@
 """A camera without a device: each picture tells its own number in black and white blocks, and trouble comes on demand.
 
 The number lies in every eye, in the middle of the picture, large enough to be read after cropping and shrinking
-(`number_in`). Used by tests, and by rigs with `device = "synthetic"`.
+(`number_in`). Used by tests, and by rigs with `device = "synthetic"`, or with trouble at set times,
+`device = "synthetic:unplugged@5+3,frozen@12+2"`: unplugged five seconds after the first frame for three seconds, …
 """
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 
@@ -16,6 +18,9 @@ from far_app.errors import ConfigError, RobotError
 from hw.camera_config import CameraConfig
 from hw.capture import Shot
 
+TROUBLES = ("unplugged", "frozen", "stuck", "slow")
+SLOW = 0.4
+"""Seconds of delay while it is slow."""
 BITS = 16
 """Of the number, as blocks of a square grid."""
 GRID = 4
@@ -62,10 +67,23 @@ class SyntheticCapture:
         """Of the newest frame."""
         self.opened = 0
         self._open = False
+        self._plan = trouble_plan(config.device)
+        self._began: float | None = None
         self._due = 0.0
         self._last: Shot | None = None
 
+    def _act_out(self) -> None:
+        """Set the switches that the plan names, as the time has it."""
+        if not self._plan:
+            return
+        self._began = self._clock() if self._began is None else self._began
+        since = self._clock() - self._began
+        now = {kind for kind, start, seconds in self._plan if start <= since < start + seconds}
+        self.unplugged, self.frozen, self.stuck = (kind in now for kind in TROUBLES[:3])
+        self.delay = SLOW if "slow" in now else 0.0
+
     def open(self) -> None:
+        self._act_out()
         if self.unplugged:
             raise RobotError("the synthetic camera is unplugged; plug it in")
         height, width = self.gives or (self._config.height, self._config.width)
@@ -79,6 +97,7 @@ class SyntheticCapture:
         self._due = self._clock()
 
     def grab(self) -> Shot:
+        self._act_out()
         if self.unplugged or not self._open:
             raise RobotError("the synthetic camera is unplugged; plug it in")
         period = 1.0 / self._config.rate
@@ -102,3 +121,16 @@ class SyntheticCapture:
             return numbered(self.number, config.height, config.width)
         half = numbered(self.number, config.height, config.width // 2)
         return np.concatenate([half, half], axis=1)
+
+
+def trouble_plan(device: str) -> list[tuple[str, float, float]]:
+    """(kind, start, duration) in seconds of each trouble that a device's name asks for."""
+    plan = []
+    for words in device.partition(":")[2].split(",") if ":" in device else ():
+        match = re.fullmatch(r"(\w+)@([\d.]+)\+([\d.]+)", words)
+        if match is None or match[1] not in TROUBLES:
+            raise ConfigError(
+                f"camera device '{device}': '{words}' must be KIND@START+SECONDS with KIND one of {', '.join(TROUBLES)}"
+            )
+        plan.append((match[1], float(match[2]), float(match[3])))
+    return plan

@@ -14,6 +14,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("far_app.cli.demo", "make demonstrations with the scripted expert"),
     "train policy": ("far_app.cli.train_policy", "train the diffusion policy on demonstrations"),
     "train critic": ("far_app.cli.train_critic", "train the IQL critic on demonstrations"),
+    "train success": ("far_app.cli.train_success", "train and calibrate a detector of success on outcomes alone"),
     "eval": ("far_app.cli.evaluate", "compare ways to retry, in lockstep, over many scenes"),
     "study": ("far_app.cli.study", "tasks × training seeds × methods from one file: models, episodes, tables"),
     "improve": ("far_app.cli.improve", "collect with retries, learn from successes and failures, again and again"),
@@ -24,6 +25,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "bench infer": ("far_app.bench.infer", "milliseconds per chunk, by preset"),
     "bench adapt": ("far_app.bench.adapt", "seconds from a failed attempt to a new policy version, by stage"),
     "bench critic": ("far_app.bench.critic", "can Q rank what the policy would do: before trusting FAR with a model"),
+    "bench success": ("far_app.bench.success", "a success detector against the twin's own check, on held-out attempts"),
     "doctor": ("far_app.cli.doctor", "what this machine has, and what to do about what it lacks"),
 }
 

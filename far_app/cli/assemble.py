@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from far_app.config import RetryConfig, TaskConfig
 from far_app.errors import CheckpointError, ConfigError
-from far_app.protocols import OWN_STATE, Method, PolicySpec
+from far_app.protocols import OWN_STATE, Method, PolicySpec, SuccessDetector
 from far_app.types import Observation
 
 if TYPE_CHECKING:
+    from far_app.cli.options import RunOptions
     from far_app.learning.critic import Critic
     from far_app.learning.engines import Engine
     from far_app.learning.policy import DiffusionPolicy
@@ -166,6 +168,24 @@ def check_device(device: str) -> None:
             f"device '{device}' was asked for, but torch {torch.__version__} sees no CUDA GPU; use --device cpu, or "
             "install a CUDA build of torch and NVIDIA's driver"
         )
+
+
+@contextlib.contextmanager
+def learned_detector(options: RunOptions, wait: float) -> Iterator[SuccessDetector]:
+    """The success detector that was asked for, looking in a thread of its own through the policy's frozen encoder.
+    Raises CheckpointError."""
+    from far_app.learning.policy import load_policy
+    from far_app.learning.success import load_detector
+    from far_app.session.watching import WatchingDetector
+
+    assert options.detector is not None, "asked for without one"
+    path, _ = checkpoints(options.task, Path(options.policy) if options.policy else None, None)
+    learned = load_detector(options.detector, load_policy(path, options.task, options.device), wait)
+    detector = WatchingDetector(learned, wait)
+    try:
+        yield detector
+    finally:
+        detector.close()
 
 
 def check_observation(spec: PolicySpec, observation: Observation) -> None:

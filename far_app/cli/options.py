@@ -54,6 +54,8 @@ class RunOptions:
     """Begin from what the checkpoint's makers recommend (the retry.toml beside it), or from the paper's settings."""
     retry: RetryConfig = field(default_factory=RetryConfig)
     """Settings of the method."""
+    detector: Path | None = None
+    """Success detector (`far train success`) in place of the twin's own check or a person."""
     judge_wait: float = 30.0
     """Seconds to wait for your word on an attempt that nobody could judge; then it is a failure. Headless: none."""
     shadow: bool = False

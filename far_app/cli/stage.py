@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from far_app.cli.assemble import Parts, assemble, check_observation
+from far_app.cli.assemble import Parts, assemble, check_observation, learned_detector
 from far_app.cli.options import RunOptions
 from far_app.cli.ports import choose_port
 from far_app.cli.preflight import preflight
@@ -75,11 +75,18 @@ class Stage:
             ),
         )  # fmt: skip
 
-    def detector(self) -> SuccessDetector:
+    @contextlib.contextmanager
+    def detector(self) -> Iterator[SuccessDetector]:
         """Who judges this stage's attempts, below the operator."""
-        if self.task.judge == "twin":
-            return TwinCheck(self.task.success_ticks)
-        return PersonJudge(0.0 if self.options.headless else self.options.judge_wait)
+        options = self.options
+        wait = 0.0 if options.headless else options.judge_wait
+        if options.detector is not None:
+            with learned_detector(options, wait) as detector:
+                yield detector
+        elif self.task.judge == "person":
+            yield PersonJudge(wait)
+        else:
+            yield TwinCheck(self.task.success_ticks)
 
     @contextlib.contextmanager
     def session(
@@ -93,7 +100,7 @@ class Stage:
         if self.page is not None:
             publisher = TelemetryPublisher(Endpoints.in_folder(self.folder).telemetry, statistics.health)
         try:
-            with revived(self.family, self.page):
+            with revived(self.family, self.page), self.detector() as detector:
                 robot = ShadowRobot(self.robot) if options.shadow else self.robot
                 session = Session(
                     settings=SessionSettings(
@@ -101,7 +108,7 @@ class Stage:
                         adaptation_limit=options.retry.adaptation_limit,
                     ),
                     robot=robot, planner=ThreadedPlanner(), method=method or self.parts.method,
-                    detector=self.detector(), task=self.task, scale=self.rig.scale_for(self.task),
+                    detector=detector, task=self.task, scale=self.rig.scale_for(self.task),
                     recorder=Recorder(writer), inbox=inbox, statistics=statistics, publisher=publisher,
                 )  # fmt: skip
                 if options.shadow:

@@ -163,6 +163,20 @@ def test_a_camera_that_is_not_there_or_gives_another_size_ends_the_start():
 # ── views ──
 
 
+def test_trouble_can_be_planned_by_the_devices_name():
+    now = [0.0]
+    config = replace(CONFIG, device="synthetic:unplugged@5+3,frozen@9+1,slow@20+1")
+    capture = SyntheticCapture(config, clock=lambda: now[0])
+    assert type(capture_for("a", config)) is SyntheticCapture
+    expected = {0.0: (), 5.0: ("unplugged",), 7.9: ("unplugged",), 8.1: (), 9.5: ("frozen",), 10.0: (), 20.5: ("slow",)}
+    for now[0], troubles in expected.items():
+        capture._act_out()
+        assert capture.unplugged == ("unplugged" in troubles) and capture.frozen == ("frozen" in troubles)
+        assert (capture.delay > 0) == ("slow" in troubles)
+    with pytest.raises(ConfigError, match="'burning@1' must be KIND@START"):
+        SyntheticCapture(replace(CONFIG, device="synthetic:burning@1"))
+
+
 def test_both_eyes_are_two_views_of_one_device():
     cameras = {"zed": replace(CONFIG, eye="both"), "wrist": CameraConfig(device="synthetic", rate=100.0)}
     assert list(views_of(cameras)) == ["zed_left", "zed_right", "wrist"]
