@@ -24,6 +24,9 @@ from far_app.learning.success import SuccessHead, SuccessRule, best, conformal_l
 
 log = logging.getLogger(__name__)
 
+EVEN_ODDS = 0.0
+"""Logit."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SuccessTraining:
@@ -114,13 +117,13 @@ def calibrated(
     head: SuccessHead, held_out: Sequence[Watched], training: SuccessTraining
 ) -> tuple[SuccessRule, dict[str, object]]:
     """Thresholds from attempts that the head has not learnt from. The early part of a success must not be taken for one
-    either: the threshold is the higher of the two."""
+    either, nor anything that the head itself holds for less likely than not: the threshold is the highest of these."""
     k = training.consecutive
     scores = [(w, scores_of(head, w.features)) for w in held_out]
     failures = np.array([best(s, k) for w, s in scores if not w.success])
     successes = np.array([best(s, k) for w, s in scores if w.success])
     early = np.array([best(s[: w.early(training)], k) for w, s in scores if w.success])
-    threshold = conformal_threshold(failures, training.false_success)
+    threshold = max(EVEN_ODDS, conformal_threshold(failures, training.false_success))
     if (len(early) + 1) * training.false_success >= 1:
         threshold = max(threshold, conformal_threshold(early, training.false_success))
     rule = SuccessRule(
