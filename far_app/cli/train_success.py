@@ -14,7 +14,7 @@ from far_app.cli.assemble import checkpoints
 
 @dataclass(frozen=True, kw_only=True)
 class TrainSuccessOptions:
-    """Learn from outcomes what success looks like. Half of the attempts only calibrate."""
+    """Learn from outcomes what success looks like."""
 
     task: str = "lift"
     policy: Path | None = None
@@ -31,6 +31,8 @@ class TrainSuccessOptions:
     """The detector's file; success.safetensors beside the policy by default, in runs/ for the shipped one."""
     false_success: float = 0.01
     """Probability that a failed attempt is taken for a success, at most; 0.01 needs 99 failures to calibrate on."""
+    held_out: float = 0.5
+    """Share of the attempts that only calibrate."""
     consecutive: int = 5
     """Frames in a row that must agree."""
     last: int = 10
@@ -52,8 +54,9 @@ def main(arguments: Sequence[str]) -> int:
     path, _ = checkpoints(options.task, options.policy, None)
     policy = load_policy(path, options.task)
     training = SuccessTraining(
-        false_success=options.false_success, consecutive=options.consecutive, last=options.last, seed=options.seed
-    )
+        false_success=options.false_success, held_out=options.held_out, consecutive=options.consecutive,
+        last=options.last, seed=options.seed,
+    )  # fmt: skip
     config, framings = policy.config, trained_framings(path)
     data = options.data or Path("datasets") / f"{options.task}.hdf5"
     shown = watch(policy, read_episodes(data, config.cameras, options.demonstrations, config.image_size, framings))

@@ -49,6 +49,14 @@ class SuccessTraining:
     """Probability that a success scores too low even to be asked about, at most."""
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        for name in ("held_out", "false_success", "missed"):
+            if not 0 < getattr(self, name) < 1:
+                raise ConfigError(f"{name} is {getattr(self, name)}, must be between 0 and 1")
+        for name in ("consecutive", "last"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} is {getattr(self, name)}, must be at least 1")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Watched:
