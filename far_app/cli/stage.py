@@ -12,7 +12,7 @@ import http.client
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -130,7 +130,7 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         family = Family()
         stack.callback(family.end)
         hardware = family.add(start_hardware(folder, options.rig, options.task))
-        page = None if options.headless else family.add(start_page(folder, options, port))
+        page = None if options.headless else family.add(start_page(folder, options, port, task.cameras))
         parts = assemble(
             options.method, task, options.policy, options.critic, options.device, options.retry, options.engine
         )
@@ -159,9 +159,9 @@ def start_hardware(folder: Path, rig: str, task: str) -> Child:
     return Child("hardware", "hw.server", arguments, folder)
 
 
-def start_page(folder: Path, options: RunOptions, port: int) -> Child:
+def start_page(folder: Path, options: RunOptions, port: int, cameras: Sequence[str]) -> Child:
     arguments = ["--run-folder", str(folder), "--host", options.host, "--port", str(port)]
-    arguments += ["--recordings", str(options.recordings.absolute())]
+    arguments += ["--cameras", *cameras, "--recordings", str(options.recordings.absolute())]
     arguments += ["--no-scene3d"] * (not options.scene3d) + ["--no-rerun"] * (not options.rerun)
     return Child("page", "ui.server", arguments, folder)
 
