@@ -121,6 +121,8 @@ def load_rig(name_or_path: str, task: str = "") -> RigConfig:
     station = table.pop("station", {}).get(task, {})
     table = laid_over(table, station)
     cameras = cameras_from(table, path.name)
+    if cameras is not None:
+        table["cameras"] = []  # named; filled in below, where they are no longer a table
     rig = from_table(RigConfig, table, path.name)
     return replace(rig, cameras=cameras, safety=replace(rig.safety, upright=rig.start_quaternion))
 
