@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from far_app.cli.preflight import preflight
 from far_app.errors import ConfigError
 from far_app.picture import Framing
 from far_app.preflight import SeenView, Setup, colours_of, differences, look, setup_from
+from far_app.protocols import PolicySpec
 from far_app.tasks import task
 from far_app.types import Observation, Pose, RobotMode, RobotStatus
 from hw.camera_config import CameraConfig, with_views
@@ -109,30 +109,30 @@ def test_a_rig_tells_its_setup():
 # ── what `far run` makes of it ──
 
 
-def parts(card: dict[str, object] | None) -> Any:
-    policy = SimpleNamespace(spec=SimpleNamespace(cameras=("front",)))
-    return SimpleNamespace(card=card, method=SimpleNamespace(policy=policy), policy_name="p.safetensors")
+SPEC = PolicySpec(
+    name="paper-lift", task="lift", horizon=8, n_obs=2, action_dim=7, cameras=("front",), image_size=84, state_keys=()
+)
 
 
 def test_differences_refuse_the_start_all_in_one_line_and_may_be_accepted(caplog):
-    other = parts({"setup": replace(HERE, rate=20.0, translation=0.005).table()})
+    other = {"setup": replace(HERE, rate=20.0, translation=0.005).table()}
     with pytest.raises(ConfigError) as refused:
-        preflight(other, HERE, observation(front=noise(0)), accepted=False)
+        preflight(SPEC, other, HERE, observation(front=noise(0)), accepted=False)
     words = str(refused.value)
     assert "(1) " in words and "(2) " in words and "--accept-differences" in words and "\n" not in words
-    preflight(other, HERE, observation(front=noise(0)), accepted=True)
+    preflight(SPEC, other, HERE, observation(front=noise(0)), accepted=True)
     assert "goes on" in caplog.text
 
 
 def test_an_old_card_refuses_a_real_arm_and_warns_in_the_twin(caplog):
     with pytest.raises(ConfigError, match="cannot compare"):
-        preflight(parts({}), HERE, observation(front=noise(0)), accepted=False)
-    preflight(parts({}), replace(HERE, robot="twin"), observation(front=noise(0)), accepted=False)
+        preflight(SPEC, {}, HERE, observation(front=noise(0)), accepted=False)
+    preflight(SPEC, {}, replace(HERE, robot="twin"), observation(front=noise(0)), accepted=False)
     assert "cannot compare" in caplog.text
 
 
 def test_a_policy_that_no_data_made_has_nothing_to_compare():
-    preflight(parts(None), HERE, observation(), accepted=False)
+    preflight(SPEC, None, HERE, observation(), accepted=False)
 
 
 def test_the_shipped_model_knows_the_twin():

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from far_app.config import RetryConfig, TaskConfig
 from far_app.errors import CheckpointError, ConfigError
-from far_app.protocols import OWN_STATE, Method, PolicySpec, SuccessDetector
+from far_app.protocols import OWN_STATE, Method, PolicySpec
 from far_app.types import Observation
 
 if TYPE_CHECKING:
-    from far_app.cli.options import RunOptions
     from far_app.learning.critic import Critic
     from far_app.learning.engines import Engine
     from far_app.learning.policy import DiffusionPolicy
@@ -40,8 +38,6 @@ class Parts:
     """Attempts a trial where the method fixes them."""
     another: Callable[[], Method]
     """One more method of the same parts, for a trial beside; the base policy is shared, so that they plan together."""
-    card: Mapping[str, object] | None = None
-    """The policy's model card; None for a policy that no data made."""
 
 
 def shipped(task: str, kind: str) -> Path:
@@ -74,7 +70,6 @@ def assemble(
         return Parts(method=scripted, policy_name=policy, max_attempts=None, another=lambda: scripted)
 
     from far_app.learning.critic_file import load_demonstrations
-    from far_app.learning.policy import read_card as read_policy_card
     from far_app.learning.runtime import ActingPolicy
     from far_app.methods import METHODS, Ingredients
     from far_app.methods import method as make_method
@@ -84,7 +79,7 @@ def assemble(
         raise ConfigError(f"unknown method '{method}'; choose one of: {', '.join(METHODS)}")
     entry = METHODS[method]
     check_device(device)
-    demonstrations, card = None, None
+    demonstrations = None
     if policy is not None and policy.startswith(UNTRAINED):
         name = policy
         network, critic_network = untrained(policy.removeprefix(UNTRAINED), task.name, device)
@@ -93,7 +88,6 @@ def assemble(
         beside = shipped(task.name, "critic") if policy is None else path.with_name("critic.safetensors")
         name = f"shipped: {path.name}" if policy is None else str(path)
         network, critic_network = trained(path, critic or beside, task.name, device, entry.needs_critic)
-        card = read_policy_card(path)
         if (retry.fcpa.guard == "bc" or entry.needs_demonstrations) and critic_network is not None:
             demonstrations = load_demonstrations(critic or beside, network)
         if critic_network is not None:
@@ -114,7 +108,7 @@ def assemble(
     )
     return Parts(
         method=make_method(method, ingredients), policy_name=name, max_attempts=entry.attempts,
-        another=lambda: make_method(method, ingredients), card=card,
+        another=lambda: make_method(method, ingredients),
     )  # fmt: skip
 
 
@@ -168,24 +162,6 @@ def check_device(device: str) -> None:
             f"device '{device}' was asked for, but torch {torch.__version__} sees no CUDA GPU; use --device cpu, or "
             "install a CUDA build of torch and NVIDIA's driver"
         )
-
-
-@contextlib.contextmanager
-def learned_detector(options: RunOptions, wait: float) -> Iterator[SuccessDetector]:
-    """The success detector that was asked for, looking in a thread of its own through the policy's frozen encoder.
-    Raises CheckpointError."""
-    from far_app.learning.policy import load_policy
-    from far_app.learning.success import load_detector
-    from far_app.session.watching import WatchingDetector
-
-    assert options.detector is not None, "asked for without one"
-    path, _ = checkpoints(options.task, Path(options.policy) if options.policy else None, None)
-    learned = load_detector(options.detector, load_policy(path, options.task, options.device), wait)
-    detector = WatchingDetector(learned, wait)
-    try:
-        yield detector
-    finally:
-        detector.close()
 
 
 def check_observation(spec: PolicySpec, observation: Observation) -> None:

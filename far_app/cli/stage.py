@@ -16,10 +16,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from far_app.cli.assemble import Parts, assemble, check_observation, learned_detector
+from far_app.cli.assemble import Parts, assemble, check_observation
+from far_app.cli.detector import learned_detector
 from far_app.cli.options import RunOptions
 from far_app.cli.ports import choose_port
-from far_app.cli.preflight import preflight
+from far_app.cli.preflight import policy_card, preflight
 from far_app.cli.processes import Child, Family, run_folder
 from far_app.config import TaskConfig
 from far_app.detectors import PersonJudge, TwinCheck
@@ -144,7 +145,10 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         if page is not None:
             wait_for_page(page, options.host, port)
         check_observation(parts.method.policy.spec, robot.observe())
-        preflight(parts, setup_of(rig, task), robot.observe(), options.accept_differences or options.shadow)
+        preflight(
+            parts.method.policy.spec, policy_card(task.name, options.policy), setup_of(rig, task), robot.observe(),
+            options.accept_differences or options.shadow,
+        )  # fmt: skip
         prepare_process(options.torch_threads)
         warm_up(parts.method.policy, robot)
         yield Stage(

@@ -13,7 +13,7 @@ from far_app.tasks import task
 from hw.camera_config import with_views
 from hw.rig import load_rig
 from hw.setup import setup_of
-from tests.test_preflight import observation, parts
+from tests.test_preflight import SPEC, observation
 
 
 def test_the_papers_rig_trains_one_view_and_its_card_fits_the_rig(tmp_path):
@@ -33,4 +33,4 @@ def test_the_papers_rig_trains_one_view_and_its_card_fits_the_rig(tmp_path):
     card = read_card(path)
     assert setup_from(card["setup"]) == here
     assert trained_framings(path)["front"].crop == (280, 0, 720, 720)
-    preflight(parts(card), here, observation(front=rng.integers(0, 256, (84, 84, 3), np.uint8)), accepted=False)
+    preflight(SPEC, card, here, observation(front=rng.integers(0, 256, (84, 84, 3), np.uint8)), accepted=False)
