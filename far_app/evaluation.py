@@ -7,6 +7,7 @@ identical for every method: a scene solved at the first attempt is solved for al
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import hashlib
 import json
 import tomllib
@@ -178,16 +179,27 @@ def run_scenes(
 
 
 def read_results(path: Path) -> list[dict[str, Any]]:
-    """Whole lines of a results file; a torn last line (a killed run) is left out."""
-    if not path.exists():
+    """Whole lines of a results file, or of its gzip where only that is there; a torn last line (a killed run) is left
+    out."""
+    packed = packed_results(path)
+    if path.exists():
+        text = path.read_text()
+    elif packed.exists():
+        text = gzip.decompress(packed.read_bytes()).decode()
+    else:
         return []
     records = []
-    for line in path.read_text().splitlines():
+    for line in text.splitlines():
         try:
             records.append(json.loads(line))
         except json.JSONDecodeError:
             continue
     return records
+
+
+def packed_results(path: Path) -> Path:
+    """Results as they are committed: `gzip -9n episodes.jsonl`."""
+    return path.with_name(path.name + ".gz")
 
 
 def prepare(folder: Path, plan: EvaluationPlan) -> dict[int, dict[str, dict[str, Any]]]:
@@ -214,6 +226,8 @@ def evaluate(
     scenes = range(plan.first_scene, plan.first_scene + plan.scenes)
     jobs = [(s, found.get(s, {})) for s in scenes if names - set(found.get(s, {}))]
     results = folder / "episodes.jsonl"
+    if not results.exists() and (packed := packed_results(results)).exists():
+        results.write_bytes(gzip.decompress(packed.read_bytes()))  # goes on where the committed results ended
     if results.exists() and not (whole := results.read_bytes()).endswith(b"\n"):
         results.write_bytes(whole[: whole.rfind(b"\n") + 1])  # a killed run's torn line; its episode is run again
     if not jobs:

@@ -1,6 +1,7 @@
 """The evaluation keeps what it has, refuses to mix, and runs a shared first attempt once."""
 
 import dataclasses
+import gzip
 import json
 import os
 import signal
@@ -44,6 +45,19 @@ def test_a_second_start_does_only_what_is_missing(tmp_path):
     assert WORKED == [102]
     found = {(r["scene"], r["arm"]) for r in read_results(tmp_path / "episodes.jsonl")}
     assert found == {(s, a) for s in (100, 101, 102) for a in ("nr", "far")}
+
+
+def test_committed_results_are_read_packed_and_go_on_from_there(tmp_path):
+    evaluate(tmp_path, dataclasses.replace(PLAN, scenes=2), 1, lambda record: None, begin, work)
+    results = tmp_path / "episodes.jsonl"
+    before = read_results(results)
+    (tmp_path / "episodes.jsonl.gz").write_bytes(gzip.compress(results.read_bytes()))
+    results.unlink()
+    assert read_results(results) == before
+    WORKED.clear()
+    evaluate(tmp_path, PLAN, 1, lambda record: None, begin, work)
+    assert WORKED == [102]
+    assert read_results(results)[: len(before)] == before
 
 
 def killed_in_scene_101(block):
