@@ -189,6 +189,7 @@ _STATUS: dict[str, tuple[str, Tone]] = {
     "adapted": ("adapted", Tone.GOOD),
     "empty": ("no pairs: policy unchanged", Tone.WARN),
     "stopped": ("adapted, stopped by the guard", Tone.GOOD),
+    "withdrawn": ("lesson withdrawn: a plain try next", Tone.WARN),
     "cancelled": ("cancelled", Tone.WARN),
     "failed": ("failed: policy unchanged", Tone.BAD),
     "timeout": ("over its time limit: policy unchanged", Tone.WARN),
