@@ -37,7 +37,7 @@ from far_app.session.recorder import Recorder
 from far_app.session.session import Session, SessionSettings
 from far_app.session.statistics import LoopStatistics
 from far_app.tasks import task as find_task
-from hw.rig import RigConfig, load_rig
+from hw.rig import RigConfig
 
 HARDWARE_PATIENCE = 180.0
 """Seconds for the hw server's first observation (a first start compiles for a while)."""
@@ -100,13 +100,13 @@ class Stage:
 @contextlib.contextmanager
 def stage(options: RunOptions) -> Iterator[Stage]:
     """Start everything, wait until it is ready, end everything. Raises the FarError of whatever cannot start."""
-    rig = load_rig(options.rig, options.task)
+    rig = options.load_rig()
     task = find_task(options.task, rig.arm)
-    port = 0 if options.headless else choose_port(options.host, options.port)
+    port = 0 if options.headless else choose_port(options.page_host, options.port)
     with run_folder() as folder, contextlib.ExitStack() as stack:
         family = Family()
         stack.callback(family.end)
-        hardware = family.add(start_hardware(folder, options.rig, options.task))
+        hardware = family.add(start_hardware(folder, options.rig_file, options.task, options.host))
         page = None if options.headless else family.add(start_page(folder, options, port))
         parts = assemble(
             options.method, task, options.policy, options.critic, options.device, options.retry, options.engine
@@ -118,24 +118,25 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         stack.callback(nice, 0)
         robot = stack.enter_context(connected(folder, hardware))
         if page is not None:
-            wait_for_page(page, options.host, port)
+            wait_for_page(page, options.page_host, port)
         check_observation(parts.method.policy.spec, robot.observe())
         prepare_process(options.torch_threads)
         warm_up(parts.method.policy, robot)
         yield Stage(
             options=options, task=task, rig=rig, parts=parts, robot=robot, folder=folder, family=family,
             hardware=hardware, page=page,
-            page_url=f"http://{options.host}:{port}" if page is not None else "",
+            page_url=f"http://{options.page_host}:{port}" if page is not None else "",
         )  # fmt: skip
 
 
-def start_hardware(folder: Path, rig: str, task: str) -> Child:
+def start_hardware(folder: Path, rig: str, task: str, address: str) -> Child:
     arguments = ["--folder", str(folder), "--rig", rig, "--task", task, "--parent", str(os.getpid())]
+    arguments += ["--address", address] * bool(address)
     return Child("hardware", "hw.server", arguments, folder)
 
 
 def start_page(folder: Path, options: RunOptions, port: int) -> Child:
-    arguments = ["--run-folder", str(folder), "--host", options.host, "--port", str(port)]
+    arguments = ["--run-folder", str(folder), "--host", options.page_host, "--port", str(port)]
     arguments += ["--recordings", str(options.recordings.absolute())]
     arguments += ["--no-scene3d"] * (not options.scene3d) + ["--no-rerun"] * (not options.rerun)
     return Child("page", "ui.server", arguments, folder)
