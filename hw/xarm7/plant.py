@@ -142,9 +142,8 @@ class XArmPlant:
         self.links.gripper.wish(gripper)
         began = time.monotonic()
         code = self.links.motion.set_servo_cartesian_aa(axis_angle(pose), is_radian=True)
-        now = time.monotonic()
-        self._sent, self._sent_at = pose, now
-        self._judge(code, now - began)
+        self._sent, self._sent_at = pose, began
+        self._judge(code, time.monotonic() - began)
 
     def advance(self) -> None:
         """An arm moves by itself."""

@@ -42,20 +42,32 @@ def clear_errors(api: XArmAPI, telling: Telling) -> None:
 
 
 def configure(api: XArmAPI, settings: XArmSettings) -> None:
-    """Tool offset and load as the rig file says; the collision sensitivity is looked at and left alone."""
+    """Tool offset and load as the rig file says, until the reports show them; the collision sensitivity is looked at
+    and left alone. Throws the arm out of its mode where something changes."""
     if api.collision_sensitivity < settings.collision_sensitivity:
         raise RobotError(
             f"the controller's collision sensitivity is {api.collision_sensitivity}, the rig asks for at least "
             f"{settings.collision_sensitivity}; set it in UFACTORY Studio (this program never changes it)"
         )
     offset, load = offset_to_wire(settings.tcp_offset), [settings.load_mass, *(c * MM for c in settings.load_center)]
-    mass, center = api.tcp_load
-    if not np.allclose(api.tcp_offset, offset, atol=SAME):
-        log.info("tool offset %s → %s", api.tcp_offset, offset)
-        check(api.set_tcp_offset(offset, is_radian=True, wait=False), "the tool offset")
-    if not np.allclose([mass, *center], load, atol=SAME):
-        log.info("load %s → %s", [mass, *center], load)
-        check(api.set_tcp_load(load[0], load[1:], wait=False), "the load")
+
+    def shown() -> list[float]:
+        mass, center = api.tcp_load
+        return [*api.tcp_offset, mass, *center]
+
+    if np.allclose(shown(), [*offset, *load], atol=SAME):
+        return
+    log.info("tool offset and load %s → %s", shown(), [*offset, *load])
+    api.set_tcp_offset(offset, is_radian=True, wait=False)  # their codes tell of the mode they end, not of success
+    api.set_tcp_load(load[0], load[1:], wait=False)
+    deadline = time.monotonic() + PATIENCE
+    while not np.allclose(shown(), [*offset, *load], atol=SAME):
+        if time.monotonic() > deadline:
+            raise RobotError(
+                f"the controller did not take the rig's tool offset and load {[*offset, *load]} (mm, rad, kg) within "
+                f"{PATIENCE:g} s, it reports {shown()}; set them in UFACTORY Studio"
+            )
+        time.sleep(0.01)
 
 
 def enter_servo_mode(api: XArmAPI, telling: Telling, settings: XArmSettings, halted: Callable[[], bool]) -> Pose:
