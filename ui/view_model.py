@@ -283,6 +283,7 @@ def summary(history: tuple[TrialRow, ...]) -> str:
     """The session so far in one line."""
     if not history:
         return "no trial finished yet"
+    history = tuple(row for row in history if row.counted)
     solved = [row for row in history if row.success]
     first = sum(row.attempts == 1 for row in solved)
     return f"{len(solved)} of {len(history)} solved · {first} at once · {len(solved) - first} after a retry"

@@ -74,6 +74,11 @@ class RunOptions:
         rig = at_address(load_rig(self.rig_file, self.task), self.host)
         if self.robot not in (None, rig.robot):
             raise ConfigError(f"--robot is {self.robot}, but rig {rig.name} ({self.rig_file}) is a {rig.robot}")
+        if self.headless and rig.robot == "xarm" and not rig.xarm.address.startswith("127."):
+            raise ConfigError(
+                f"--headless is for the twin and the fake controller: a real arm (at {rig.xarm.address}) needs somebody "
+                "who watches its page"
+            )
         return rig
 
     def __post_init__(self) -> None:

@@ -75,12 +75,12 @@ class Board:
         self.adapting, self._latest = False, adaptation
         self.adaptation_steps = adaptation.history or self.adaptation_steps
 
-    def trial_ended(self, trial: Trial, judged_by: str, note: str) -> None:
+    def trial_ended(self, trial: Trial, judged_by: str, note: str, counted: bool = True) -> None:
         self._history.append(
             TrialRow(
                 trial=self.trial, scene_seed=self.scene_seed, attempts=len(trial.attempts), success=trial.success,
                 judged_by=judged_by, flagged=sum(len(a.flagged) for a in trial.adaptations),
-                seconds=time.monotonic() - self._began, note=note,
+                seconds=time.monotonic() - self._began, note=note, counted=counted,
             )
         )  # fmt: skip
 

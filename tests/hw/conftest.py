@@ -1,5 +1,5 @@
-"""One robot three times, for the contract tests: the twin in lockstep in this process, the twin behind sockets in its own,
-and a real arm's driver there against the fake controller."""
+"""One robot three times, for the contract tests: the twin in lockstep in this process, the twin behind sockets in its
+own, and a real arm's driver there against the fake controller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every Robot promises: the lockstep twin, the twin in a server process, a real arm's driver on the fake controller."""
+"""What every Robot promises: the twin in lockstep and in its server, a real arm's driver on the fake controller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Everything that can go wrong with a real arm ends in a held arm, words for the operator, and Resume without a jump."""
+"""Whatever goes wrong with a real arm ends in a held arm, words for the operator, and Resume without a jump."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What reaches a real controller, seen where it arrives: the driver through the unmodified SDK on the fake controller."""
+"""What reaches a controller, seen where it arrives: the driver through the unmodified SDK on the fake controller."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def test_the_gripper_follows_without_stalling_the_servo_loop(cell: Cell, fake: F
     cell.drive(close, 30)
     cell.drive(close + np.array((0, 0, 0, 0, 0, 0, -0.02)), 10)
     targets, state = fake.servo_targets(), fake.state()
-    assert fake_at["gripper"] > 800 > 100 > state["gripper"]
+    assert fake_at["gripper"] > 800 and state["gripper"] < 100
     assert state["gripper_writes"] - writes == 1, "told once; a change within the hysteresis is not told"
     assert cell.servo.newest.measured.gripper < 0.1, "its opening is read back"
     assert np.percentile(np.diff([t["at"] for t in targets]), 95) < 0.02
