@@ -76,8 +76,8 @@ class RunOptions:
             raise ConfigError(f"--robot is {self.robot}, but rig {rig.name} ({self.rig_file}) is a {rig.robot}")
         if self.headless and rig.robot == "xarm" and not rig.xarm.address.startswith("127."):
             raise ConfigError(
-                f"--headless is for the twin and the fake controller: a real arm (at {rig.xarm.address}) needs somebody "
-                "who watches its page"
+                f"--headless is for the twin and the fake controller: a real arm (at {rig.xarm.address}) needs "
+                "somebody who watches its page"
             )
         return rig
 
