@@ -1,13 +1,15 @@
 """What the controller tells by itself: pose, joints, state and mode a hundred times a second, errors five times.
 
 Two connections, because the fast report carries no error code. Nobody asks for the error code on the one whose error
-callback is used: a question would keep the callback from coming.
+callback is used: a question would keep the callback from coming. The pose is read from the report itself: the SDK's own
+copy stands still for ever once anything on that connection (a gripper call) has met an error from C1 to C17.
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -48,11 +50,11 @@ class Telling:
         self.slow_at = time.monotonic()
 
     def _on_fast(self, words: dict) -> None:
-        arm = self._fast._arm
+        report: Any = self._fast._arm.report_data
+        pose, joints = np.array(report.actual_tcp_pose, dtype=float), np.array(report.actual_joint_angle[:7], dtype=float)
         self.newest = Told(
-            pose=pose_from_rpy(arm._position), joints=np.array(arm._angles[:7]), state=arm._state, mode=arm._mode,
-            at=time.monotonic(),
-        )  # fmt: skip
+            pose=pose_from_rpy(pose), joints=joints, state=report.state, mode=report.mode, at=time.monotonic()
+        )
 
     def wait_fast(self, after: float, seconds: float) -> Told | None:
         """The first fast report read later than a moment; None when none comes in time."""

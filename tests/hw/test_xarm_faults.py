@@ -55,7 +55,10 @@ def resumes_without_a_jump(cell: Cell) -> None:
     targets = cell.fake.servo_targets()
     assert np.linalg.norm(np.array(targets[0]["pose"][:3]) - before) < STEP
     assert steps(targets).max() < STEP
-    assert np.linalg.norm(np.array(cell.fake.state()["position"]) - before) > 2.0, "it moves again"
+    there = np.array(cell.fake.state()["position"])
+    assert np.linalg.norm(there - before) > 2.0, "it moves again"
+    measured = cell.servo.newest.measured.eef.position
+    assert np.linalg.norm(1e3 * measured - there) < 15.0, "and is seen to: the SDK's own pose freezes after C1 to C17"
 
 
 @pytest.mark.parametrize(
@@ -77,6 +80,7 @@ def test_an_error_of_the_arm_is_told_in_the_vendors_words_and_cleared_by_the_ope
 
 def test_a_pressed_emergency_stop_stays_until_it_is_released(cell: Cell, fake: FakeXArm) -> None:
     status = while_driving(cell, lambda: fake.tell(do="press", code=1))
+    time.sleep(0.3)  # the gripper's thread meets the error meanwhile
     assert "C1: The Emergency Stop Button" in status.reason
     with pytest.raises(RobotError, match="still reports C1"):
         cell.resume()
