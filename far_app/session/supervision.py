@@ -198,6 +198,8 @@ class Supervision:
             self.fault(status.reason or "the arm reports a fault", lesson=True)  # the policy's own doing
         elif latched and self.state not in (State.STOPPED, State.FAULT, State.FINISHED):
             self._stopped(Happening.LATCH, status.reason or "STOP")
+        if phase == "homing" and self.state in (State.HOMING, State.ADAPTING) and status.mode is RobotMode.HOMING:
+            self.board.reason = status.reason  # what the way home waits for
         if phase == "attempt" and self.planner.failure is not None:
             self.fault(str(self.planner.failure))
         unseen = time.monotonic() - self.inbox.looked_at
@@ -263,6 +265,8 @@ class Supervision:
             case Intent.STOP:
                 self._hold("STOP pressed by the operator", latch=True)
                 return self._stopped(Intent.STOP, "STOP pressed by the operator")
+            case Intent.RESUME if self.state in (State.HOMING, State.ADAPTING):
+                self._answer_the_way_home()
             case Intent.RESUME if self.state is not State.PAUSED and not self._unlatch():
                 return None
             case Intent.PAUSE:
@@ -293,6 +297,14 @@ class Supervision:
             self.board.reason = reason
         self.happen(event)
         self.say(reason, "warning")
+
+    def _answer_the_way_home(self) -> None:
+        """The operator has taken what the hand holds: it may open (tasks whose release is "ask")."""
+        try:
+            self.robot.request(Resume())
+        except RobotError as error:
+            self.board.refusal = str(error)
+            self.say(str(error), "error")
 
     def _unlatch(self) -> bool:
         """Ask the hw server to leave its latch; what it answers is shown when it refuses."""

@@ -51,7 +51,10 @@ class Telling:
 
     def _on_fast(self, words: dict) -> None:
         report: Any = self._fast._arm.report_data
-        pose, joints = np.array(report.actual_tcp_pose, dtype=float), np.array(report.actual_joint_angle[:7], dtype=float)
+        pose, joints = (
+            np.array(report.actual_tcp_pose, dtype=float),
+            np.array(report.actual_joint_angle[:7], dtype=float),
+        )
         self.newest = Told(
             pose=pose_from_rpy(pose), joints=joints, state=report.state, mode=report.mode, at=time.monotonic()
         )

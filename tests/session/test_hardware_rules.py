@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,9 +13,9 @@ from far_app.cli.options import RunOptions
 from far_app.cli.run import on_this_robot
 from far_app.config import PerturbationConfig, RetryConfig
 from far_app.errors import ConfigError
-from far_app.protocols import Hold
+from far_app.protocols import Hold, Resume
 from far_app.session_states import Intent, State
-from tests.session.kinematic import Forward
+from tests.session.kinematic import Forward, KinematicRobot
 from tests.session.test_session import Desk
 
 
@@ -119,6 +120,19 @@ def test_the_sessions_first_attempt_runs_slower_over_the_same_way_and_is_not_cou
     np.testing.assert_allclose(np.diff(x[:40]), 0.5 * np.diff(x[40:]).mean(), rtol=1e-6)
     assert x[39] == pytest.approx(x[59], abs=1e-9), "the same way"
     assert [row.counted for row in desk.session.board._history] == [False, True]
+
+
+def test_a_way_home_that_asks_is_shown_and_answered_by_resume():
+    desk = Desk(robot=KinematicRobot(homing_ticks=10**6), headless=False)
+    thread = started(desk)
+    eventually(lambda: desk.state is State.HOMING, "it goes home")
+    desk.robot.status = replace(desk.robot.status, reason="take what the hand holds, then resume")
+    eventually(lambda: "take what the hand holds" in desk.session.board.reason, "the page says what is waited for")
+    desk.inbox.put(Intent.RESUME)
+    eventually(lambda: any(isinstance(r, Resume) for r in desk.robot.requests), "the arm is told")
+    desk.inbox.put(Intent.QUIT)
+    thread.join(5)
+    assert desk.state is State.FINISHED
 
 
 def test_on_a_real_arm_perturbation_is_smoothed_and_of_x_y_z_unless_told_otherwise():
