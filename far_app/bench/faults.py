@@ -1,9 +1,9 @@
 """`far bench faults`: everything that can go wrong with a real arm, again and again, on the fake controller.
 
-For each fault: milliseconds until the last servo target that moved (then the arm holds), the largest servo step, whether
-anything left the workspace box, what the operator read, whether Resume led on, and how far its first target lay from
-where the arm stood. One session through the real processes, and the recording it left; the app's and the hw server's
-SIGKILL in sessions of their own (far_app/bench/killed.py).
+For each fault: milliseconds until the last servo target that moved (then the arm holds), the largest servo step, how
+many targets left the workspace box, what the operator read, whether Resume led on, and how far its first target lay
+from where the arm stood. One session through the real processes, and the recording it left; the app's and the hw
+server's SIGKILL in sessions of their own (far_app/bench/killed.py).
 """
 
 from __future__ import annotations
@@ -73,6 +73,8 @@ class Bench:
     stage: Stage
     session: Session
     inbox: IntentInbox
+    struck: float = 0.0
+    """When the last fault began."""
     box: tuple[np.ndarray, np.ndarray] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -105,6 +107,7 @@ class Bench:
 def _stop_while_stuck(bench: Bench) -> None:
     bench.fake.faults(latency=0.09)
     time.sleep(0.1)
+    bench.struck = time.monotonic()
     bench.stop()
 
 
@@ -191,8 +194,9 @@ def once(bench: Bench, fault: Fault) -> dict[str, Any]:
     if not moving:
         raise FarError(f"the arm does not move: {bench.state}, {bench.session.board.reason}")
     bench.fake.received()
-    struck = time.monotonic()
+    bench.struck = time.monotonic()
     fault.strike(bench)
+    struck = bench.struck
     noticed = not fault.latches or bench.wait(lambda: bench.state in (State.FAULT, State.STOPPED), PATIENCE)
     noticed_after = time.monotonic() - struck
     words = bench.session.board.reason

@@ -19,7 +19,7 @@ MM = 1000.0
 _AXES = np.eye(3)
 
 
-def pose_from_rpy(values: Sequence[float]) -> Pose:
+def pose_from_rpy(values: Sequence[float] | Float[np.ndarray, "6"]) -> Pose:
     """A reported pose: x, y, z in mm; roll, pitch, yaw in radians, R = Rz(yaw) Ry(pitch) Rx(roll)."""
     x, y, z = (quat_from_rotvec(axis * angle) for axis, angle in zip(_AXES, values[3:6], strict=True))
     return Pose(position=np.asarray(values[:3]) / MM, quaternion=quat_multiply(z, quat_multiply(y, x)))
