@@ -109,9 +109,9 @@ def banner(telemetry: Telemetry | None, fresh: Freshness) -> Banner:
 def _detail(telemetry: Telemetry) -> str:
     t = telemetry
     if t.countdown > 0:
-        return f"Next attempt in {t.countdown:.0f} s. Pause to cancel."
+        return t.reason or f"Next attempt in {t.countdown:.0f} s. Pause to cancel."
     home = f"going home {100 * t.homing_progress:.0f} %"
-    if t.state is State.ADAPTING:
+    if t.state is State.ADAPTING and not t.reason:
         flagged = (
             _count(len(t.flagged), "chunk") + " flagged" if t.flagged else _STATUS.get(t.adaptation_status, ("",))[0]
         )

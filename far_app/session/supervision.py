@@ -160,11 +160,15 @@ class Supervision:
         cancels it, and after Resume it is announced anew. Raises TrialAbandoned as `attend` does."""
         begins = time.monotonic() + seconds
         while (left := begins - time.monotonic()) > 0.0:
+            self.board.countdown = float(math.ceil(left))
             self.board.reason = f"{what} begins in {math.ceil(left)} s: Pause or STOP cancels"
             self.show()
             time.sleep(self.clock.period)
             self.robot.request(Heartbeat())
-            held = self.attend("homing")
+            try:
+                held = self.attend("homing")
+            finally:
+                self.board.countdown = 0.0
             if held or (self.robot.newest is not None and not self.robot.newest.status.at_home):
                 begins = time.monotonic() + seconds
         self.board.reason = ""

@@ -28,7 +28,7 @@ from hw.plant import Measured
 from hw.rig import RigConfig
 from hw.safety import near, near_turn
 from hw.xarm7.gripper import Gripper
-from hw.xarm7.sdk import ABLE, HAS_ERROR, NOT_CONNECTED, OK, SERVO_MODE, TIMEOUT, connect, error_text
+from hw.xarm7.sdk import ABLE, HAS_ERROR, NOT_CONNECTED, OK, SERVO_MODE, TIMEOUT, Report, connect, error_text
 from hw.xarm7.start import PATIENCE, clear_errors, enter_servo_mode
 from hw.xarm7.stop import StopLine
 from hw.xarm7.telling import Telling, Told
@@ -62,9 +62,16 @@ class Links:
     def open(cls, rig: RigConfig) -> Links:
         """Three connections. Raises RobotError."""
         settings = rig.xarm
-        motion = connect(settings, "rich", settings.call_timeout)
-        feedback = connect(settings, "real", 0.5)
-        stop = connect(settings, "none", 0.2)
+        opened: list[XArmAPI] = []
+        try:
+            kinds: tuple[tuple[Report, float], ...] = (("rich", settings.call_timeout), ("real", 0.5), ("none", 0.2))
+            for report, timeout in kinds:
+                opened.append(connect(settings, report, timeout))
+        except RobotError:
+            for api in opened:
+                api.disconnect()
+            raise
+        motion, feedback, stop = opened
         links = cls(
             motion=motion, feedback=feedback, stop=StopLine(stop, (motion, feedback)),
             telling=Telling(motion, feedback), gripper=Gripper(feedback, settings.gripper),

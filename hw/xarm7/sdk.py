@@ -23,6 +23,8 @@ from hw.xarm7.settings import XArmSettings
 
 log = logging.getLogger(__name__)
 
+Report = Literal["rich", "real", "none"]
+"""What a connection is told unasked: everything five times a second, pose and state a hundred times, nothing."""
 OK, HAS_ERROR, TIMEOUT, NOT_READY, NOT_CONNECTED = 0, 1, 3, 9, -1
 """Return codes of calls (xarm/x3/code.py)."""
 SERVO_MODE = 1
@@ -34,7 +36,7 @@ sdk_logger.setLevel(logging.CRITICAL)  # it writes a line for every failed call;
 sdk_printer.setLevel(logging.CRITICAL)
 
 
-def connect(settings: XArmSettings, report: Literal["rich", "real", "none"], timeout: float) -> XArmAPI:
+def connect(settings: XArmSettings, report: Report, timeout: float) -> XArmAPI:
     """A connection of its own. Raises RobotError when there is none within settings.connect_timeout seconds.
 
     timeout: seconds each call on it waits for its answer."""
