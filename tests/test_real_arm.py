@@ -14,6 +14,7 @@ import pytest
 
 from far_app.recording.inspect import find_session, inspect_session
 from hw.fake_xarm.control import FakeXArm
+from hw.fake_xarm.protocol import Function
 from tests.hw.conftest import FAKE_PORT, loopback
 from ui.raw_client import RawClient
 
@@ -131,3 +132,27 @@ def test_the_death_of_the_app_holds_the_arm_and_leaves_a_readable_recording(fake
     run.process.wait()
     found = inspect_session(find_session(tmp_path))
     assert found.trials[0].attempts[0].steps > 10
+
+
+@pytest.mark.slow
+def test_stop_from_the_page_reaches_the_controller_while_the_app_is_frozen(fake: FakeXArm, tmp_path: Path) -> None:
+    run = Run(fake, tmp_path, "--full-speed")
+    try:
+        run.shows("Rebuild the scene")
+        run.press("Scene ready")
+        run.shows("begins in 3 s: Pause or STOP cancels")
+        eventually(lambda: moves(fake) > 0.5)
+        run.process.send_signal(signal.SIGSTOP)
+        eventually(lambda: moves(fake) == 0.0)
+        run.press("STOP")
+        time.sleep(0.5)
+        assert [r for r in fake.received() if r["function"] == Function.SET_STATE and r["argument"] == 4]
+        assert fake.state()["state"] == 4
+        run.process.send_signal(signal.SIGCONT)
+        run.shows("STOPPED", "arm latched")
+        run.press("Resume")
+        run.shows("begins in 3 s: Pause or STOP cancels")
+    finally:
+        run.process.send_signal(signal.SIGCONT)
+        code, err = run.close()
+    assert code == 0, err

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from far_app.errors import ConfigError, RobotError
+from far_app.protocols import Hold, Resume
 from far_app.types import Pose, RobotMode
 from hw.fake_xarm.control import FakeXArm
 from hw.fake_xarm.protocol import Function
 from hw.rig import at_address, load_rig
 from hw.xarm7.plant import XArmPlant
 from tests.hw.cell import BACK, FORWARD, TASK, Cell, rig_at, steps
-from tests.hw.conftest import FAKE_PORT, loopback
+from tests.hw.conftest import FAKE_PORT, XArmBench, loopback
 
 pytestmark = pytest.mark.filterwarnings("ignore:The 'warn' method is deprecated")  # the SDK's
 STEP = 2.5 + 1e-3
@@ -220,3 +221,15 @@ def test_a_rig_faster_than_its_servo_step_is_refused() -> None:
     rig = load_rig("xarm7")
     with pytest.raises(ConfigError, match=r"servo step of at most 2\.5 mm at 100 Hz allows 0\.25 m/s"):
         replace(rig, safety=replace(rig.safety, speed=0.4))
+
+
+def test_a_latching_hold_stops_the_arm_at_its_controller_too(xarm: XArmBench) -> None:
+    xarm.start(seed=1)
+    xarm.drive(FORWARD, 6)
+    xarm.robot.request(Hold(reason="STOP", latch=True))
+    received = xarm.fake.received()
+    assert [r for r in received if r["function"] == Function.SET_STATE and r["argument"] == 4]
+    assert xarm.fake.state()["state"] == 4
+    xarm.robot.request(Resume())
+    assert xarm.fake.state()["mode"] == 1
+    assert xarm.robot.observe().status.mode is RobotMode.HOLD
