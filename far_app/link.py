@@ -171,10 +171,15 @@ class RemoteRobot:
                 raise RobotError("this link to the hw server was closed; make another")
             self._request_number += 1
             number = str(self._request_number).encode()
-            deadline = time.monotonic() + limit
+            began = time.monotonic()
             try:
                 self._requests.send_multipart([number, pack(request)], zmq.NOBLOCK)
-                while self._requests.poll(max(0, int(1000 * (deadline - time.monotonic())))):
+                while (waited := time.monotonic() - began) < limit:
+                    if isinstance(request, Resume) and min(waited, self.silence()) > REQUEST_TIMEOUT:
+                        limit = REQUEST_TIMEOUT  # an arm that is made ready takes its time, but its server is heard
+                        break
+                    if not self._requests.poll(int(1000 * min(POLL, limit - waited))):
+                        continue
                     answered, raw = self._requests.recv_multipart()
                     if answered == number:  # else the late answer to a request that was given up
                         reply = unpack(raw)

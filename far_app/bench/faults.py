@@ -214,7 +214,11 @@ def once(bench: Bench, fault: Fault) -> dict[str, Any]:
         "hold_s": max(0.0, float(moved[-1] - struck)) if len(moved) and fault.latches else 0.0,
         "step_mm": float(size.max(initial=0.0)), "stop_s": stops[0] - struck if stops else None,
     }  # fmt: skip
-    return shot | (resume(bench) if fault.latches else {"resumed": bench.state is State.RUNNING, "first_mm": 0.0})
+    return shot | (
+        resume(bench)
+        if fault.latches
+        else {"resumed": bench.state not in (State.FAULT, State.STOPPED), "first_mm": 0.0}
+    )
 
 
 def resume(bench: Bench) -> dict[str, Any]:
