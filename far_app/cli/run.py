@@ -34,7 +34,7 @@ def main(arguments: Sequence[str]) -> int:
         check_writable(options.summary_json)
     results, statistics = run(options)
     if options.summary_json is not None:
-        write_json(options.summary_json, {"trials": [dataclasses.asdict(r) for r in results], **statistics.summary()})
+        write_json(options.summary_json, {"trials": [told(r) for r in results], **statistics.summary()})
     counted = [r for r in results if r.counted]
     apart = f"; {len(results) - len(counted)} that began at reduced speed not counted" * (counted != results)
     print(f"{sum(r.success for r in counted)} of {len(counted)} trials succeeded{apart}", flush=True)
@@ -49,6 +49,14 @@ def on_this_robot(options: RunOptions, retry: RetryConfig) -> RetryConfig:
     return dataclasses.replace(
         retry, perturbation=dataclasses.replace(retry.perturbation, kind="smoothed", dims=(0, 1, 2))
     )
+
+
+def told(result: TrialResult) -> dict[str, Any]:
+    """A trial in the summary; that it does not count is said where it does not."""
+    fields = dataclasses.asdict(result)
+    if result.counted:
+        del fields["counted"]
+    return fields
 
 
 def run(options: RunOptions) -> tuple[list[TrialResult], LoopStatistics]:
