@@ -7,10 +7,12 @@ identical for every method: a scene solved at the first attempt is solved for al
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import hashlib
 import json
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,10 +20,8 @@ from typing import Any
 from far_app.config import RetryConfig, from_table
 from far_app.errors import ConfigError
 from far_app.types import Trial
-from far_app.workers import Begin, Block, Work, Workers, local_workers
+from far_app.workers import Begin, Job, Work, Workers, local_workers
 
-BLOCK = 16
-"""Scenes a worker takes at a time."""
 DEV_SCENES = 20_000
 """Scene seeds for choices (settings, variants)."""
 REPORT_SCENES = 30_000
@@ -132,39 +132,74 @@ def episode_record(arm: str, scene: int, result: Trial) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def run_block(
-    block: Block, arms: Sequence[str], run: Callable[[str, list[int]], Iterator[tuple[int, Trial]]]
-) -> Iterator[dict[str, Any]]:
-    """The records of a block that are still missing, each as it is there; `run` runs scenes under an arm. A success at
-    the first attempt under one arm is every arm's, and is run once."""
-    known = {scene: dict(done) for scene, done in block}
-    for arm in arms:
-        missing = []
-        for scene, done in known.items():
-            shared = next((r for r in done.values() if r["success"] and r["attempts"] == 1), None)
-            if arm in done:
-                continue
-            if shared is None:
-                missing.append(scene)
-                continue
-            done[arm] = shared | {"arm": arm, "shared": True}
-            yield done[arm]
-        for scene, result in run(arm, missing):
-            known[scene][arm] = episode_record(arm, scene, result)
-            yield known[scene][arm]
+Episode = tuple[str, int]
+"""An arm and a scene."""
+
+
+def run_scenes(
+    jobs: Iterable[Job], arms: Sequence[str],
+    run: Callable[[Callable[[], Episode | None]], Iterator[tuple[Episode, Trial]]],
+) -> Iterator[dict[str, Any]]:  # fmt: skip
+    """The missing records of scenes, each as it is there; `run` runs the episodes it is handed side by side. A scene's
+    first arm goes first: a success at the first attempt is every arm's, and is run once. Scenes are taken from `jobs`
+    one by one, as room is."""
+    waiting = iter(jobs)
+    known: dict[int, dict[str, dict[str, Any]]] = {}
+    ready: deque[Episode] = deque()
+    told: deque[dict[str, Any]] = deque()
+
+    def follow(scene: int) -> None:
+        """What is next for a scene of which something is known: nothing more to run, or all other arms."""
+        missing = [a for a in arms if a not in known[scene]]
+        shared = next((r for r in known[scene].values() if r["success"] and r["attempts"] == 1), None)
+        if shared is None:
+            ready.extend((arm, scene) for arm in missing)
+        else:
+            told.extend(shared | {"arm": arm, "shared": True} for arm in missing)
+        del known[scene]
+
+    def take() -> Episode | None:
+        while not ready and (job := next(waiting, None)) is not None:
+            scene, done = job
+            known[scene] = dict(done)
+            if not done:
+                return arms[0], scene
+            follow(scene)
+        return ready.popleft() if ready else None
+
+    for (arm, scene), result in run(take):
+        record = episode_record(arm, scene, result)
+        yield record
+        if scene in known:
+            known[scene][arm] = record
+            follow(scene)
+        while told:
+            yield told.popleft()
+    yield from told
 
 
 def read_results(path: Path) -> list[dict[str, Any]]:
-    """Whole lines of a results file; a torn last line (a killed run) is left out."""
-    if not path.exists():
+    """Whole lines of a results file, or of its gzip where only that is there; a torn last line (a killed run) is left
+    out."""
+    packed = packed_results(path)
+    if path.exists():
+        text = path.read_text()
+    elif packed.exists():
+        text = gzip.decompress(packed.read_bytes()).decode()
+    else:
         return []
     records = []
-    for line in path.read_text().splitlines():
+    for line in text.splitlines():
         try:
             records.append(json.loads(line))
         except json.JSONDecodeError:
             continue
     return records
+
+
+def packed_results(path: Path) -> Path:
+    """Results as they are committed: `gzip -9n episodes.jsonl`."""
+    return path.with_name(path.name + ".gz")
 
 
 def prepare(folder: Path, plan: EvaluationPlan) -> dict[int, dict[str, dict[str, Any]]]:
@@ -185,20 +220,20 @@ def evaluate(
     work: Work, run: Workers = local_workers,
 ) -> None:  # fmt: skip
     """Run what is missing; every finished episode is on disk before the next is counted. `begin` sets a worker process
-    up, `work` runs a block of scenes in it; both are importable functions (far_app/cli/evaluate.py)."""
+    up, `work` runs a stream of scenes in it; both are importable functions (far_app/cli/evaluate.py)."""
     found = prepare(folder, plan)
     names = {a.name for a in plan.arms}
     scenes = range(plan.first_scene, plan.first_scene + plan.scenes)
     jobs = [(s, found.get(s, {})) for s in scenes if names - set(found.get(s, {}))]
-    size = max(1, min(BLOCK, -(-len(jobs) // max(1, workers))))
-    blocks = [jobs[i : i + size] for i in range(0, len(jobs), size)]
     results = folder / "episodes.jsonl"
+    if not results.exists() and (packed := packed_results(results)).exists():
+        results.write_bytes(gzip.decompress(packed.read_bytes()))  # goes on where the committed results ended
     if results.exists() and not (whole := results.read_bytes()).endswith(b"\n"):
         results.write_bytes(whole[: whole.rfind(b"\n") + 1])  # a killed run's torn line; its episode is run again
-    if not blocks:
+    if not jobs:
         return
     with results.open("a") as file:
-        for record in run(plan, blocks, workers, begin, work):
+        for record in run(plan, jobs, workers, begin, work):
             file.write(json.dumps(record) + "\n")
             file.flush()
             progress(record)

@@ -1,5 +1,5 @@
-"""Workers on a Ray cluster: the same blocks, the same records. A worker that dies is replaced, and the rest of its
-block goes to the next one; what it had told is kept, so nothing is lost or counted twice.
+"""Workers on a Ray cluster: the same scenes in blocks, the same records. A worker that dies is replaced, and
+the rest of its block goes to the next one; what it had told is kept, so nothing is lost or counted twice.
 
 Ray is an optional extra. Checkpoints must lie at the same paths on every machine.
 """
@@ -15,8 +15,10 @@ from functools import partial
 from typing import Any
 
 from far_app.errors import ConfigError, FarError
-from far_app.workers import Begin, Block, Record, Work, Workers
+from far_app.workers import Begin, Job, Record, Work, Workers
 
+BLOCK = 16
+"""Scenes a worker takes at a time; fewer towards the end, so that all end together."""
 DEATHS = 3
 """Workers that one block may cost before the run gives up on it."""
 
@@ -44,14 +46,14 @@ def ray_workers(address: str | None = None) -> Workers:
 
 
 def _run(
-    ray: Any, address: str | None, plan: Any, blocks: Sequence[Block], count: int, begin: Begin, work: Work
+    ray: Any, address: str | None, plan: Any, jobs: Sequence[Job], count: int, begin: Begin, work: Work
 ) -> Iterator[Record]:
     alone: dict[str, Any] = {"num_cpus": count, "include_dashboard": False}
     if address is not None:
         _knock(address)
     ray.init(address=address, log_to_driver=False, **({} if address else alone))
     try:
-        yield from _distribute(ray, plan, blocks, count, begin, work)
+        yield from _distribute(ray, plan, blocks(jobs, count), count, begin, work)
     finally:
         ray.shutdown()
 
@@ -67,13 +69,25 @@ def _knock(address: str) -> None:
         ) from error
 
 
-def _distribute(ray: Any, plan: Any, blocks: Sequence[Block], count: int, begin: Begin, work: Work) -> Iterator[Record]:
+def blocks(jobs: Sequence[Job], workers: int) -> list[Sequence[Job]]:
+    """Jobs in blocks of BLOCK, smaller where the rest would not go round twice."""
+    parts: list[Sequence[Job]] = []
+    while jobs:
+        size = max(1, min(BLOCK, len(jobs) // (2 * workers)))
+        parts.append(jobs[:size])
+        jobs = jobs[size:]
+    return parts
+
+
+def _distribute(
+    ray: Any, plan: Any, blocks: Sequence[Sequence[Job]], count: int, begin: Begin, work: Work
+) -> Iterator[Record]:
     @ray.remote(num_cpus=1, max_restarts=0)
     class Worker:
         def __init__(self) -> None:
             self.ready = False
 
-        def run(self, block: Block) -> Iterator[Record]:
+        def run(self, block: Sequence[Job]) -> Iterator[Record]:
             if not self.ready:
                 begin(plan)
                 self.ready = True

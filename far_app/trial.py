@@ -26,6 +26,7 @@ from far_app.motion import ActionScale, TargetIntegrator
 from far_app.protocols import Heartbeat, Hold, Home, Method, Planner, PlanRequest, Reset, Robot, SuccessDetector
 from far_app.types import (
     ACTION_DIM,
+    ARM_DIMS,
     ActionChunk,
     Adaptation,
     Attempt,
@@ -48,6 +49,8 @@ class Tick:
     attempt_index: int
     step: Step | None = None
     """The step that the last tick completed, with its acknowledged action and lateness."""
+    between: bool = False
+    """At reduced speed: a tick on the way from one of the policy's to the next."""
 
 
 class AfterHold(float):
@@ -102,6 +105,7 @@ def trial(
     task: TaskConfig,
     scale: ActionScale,
     start_adaptation: StartAdaptation,
+    stretch: int = 1,
 ) -> TrialEvents:
     """Algorithm 1. Returns the trial's attempts and adaptations; afterwards the method holds the base policy again."""
     attempts: list[Attempt] = []
@@ -111,7 +115,8 @@ def trial(
     yield from go_home(robot, attempt_index=1)
     for i in range(1, task.max_attempts + 1):
         yield AttemptStarted(attempt_index=i, policy_version=method.policy.version)
-        attempt = yield from execute(robot, planner, method, detector, task, scale, scene_seed, i)
+        slowly = stretch if i == 1 else 1
+        attempt = yield from execute(robot, planner, method, detector, task, scale, scene_seed, i, slowly)
         attempts.append(attempt)
         last = attempt.outcome.success or i == task.max_attempts
         yield AttemptEnded(attempt=attempt, last=last)
@@ -134,8 +139,11 @@ def execute(
     scale: ActionScale,
     scene_seed: int,
     index: int,
+    stretch: int = 1,
 ) -> Generator[Event, float | ActionChunk | None, Attempt]:
-    """One attempt. A tick: observe → judge → chunk → aggregate → perturb → target."""
+    """One attempt. A tick: observe → judge → chunk → aggregate → perturb → target.
+
+    Stretched, each of the policy's ticks takes so many of the robot's: the same way and the same horizon, slower."""
     spec = method.policy.spec
     plan = Plan(horizon=spec.horizon)
     perturbation = method.perturb(index, scene_seed)
@@ -151,7 +159,7 @@ def execute(
         assert isinstance(deadline, float), "a Tick is answered with its deadline"
         observation = robot.observe()
         if step is not None:
-            steps.append(completed(step, observation, integrator))
+            steps.append(completed(step, observation, integrator, stretch))
         if isinstance(deadline, AfterHold):
             plan, integrator = Plan(horizon=spec.horizon), TargetIntegrator(scale, observation.eef)
             history.clear()
@@ -167,7 +175,17 @@ def execute(
         action = plan.action(t)  # â_t = g(chunks)
         delta = perturbation(t) if action is not None else np.zeros(ACTION_DIM)  # δ_t
         commanded = np.clip(action + delta, -1.0, 1.0) if action is not None else hold_still(steps)
-        target = integrator.target(commanded, observation.eef, deadline)
+        part = commanded / np.array((stretch,) * ARM_DIMS + (1,))
+        for _ in range(stretch - 1):
+            robot.send(integrator.target(part, robot.observe().eef, deadline))
+            deadline = yield Tick(phase="attempt", attempt_index=index, between=True)
+            assert isinstance(deadline, float), "a Tick is answered with its deadline"
+            for ack in robot.observe().acks:
+                integrator.executed(ack)
+            if isinstance(deadline, AfterHold):
+                plan, integrator = Plan(horizon=spec.horizon), TargetIntegrator(scale, robot.observe().eef)
+                history.clear()
+        target = integrator.target(part, robot.observe().eef, deadline)
         robot.send(target)
         step = Step(
             tick=t, seq=target.seq, stamp=observation.stamp, deadline=deadline, observation=observation,
@@ -216,12 +234,13 @@ def go_home(
             return
 
 
-def completed(step: Step, observation: Observation, integrator: TargetIntegrator) -> Step:
-    """The step with what was sent and how late, once its target is acknowledged."""
+def completed(step: Step, observation: Observation, integrator: TargetIntegrator, stretch: int) -> Step:
+    """The step with what was sent and how late, once its target (the last of its `stretch` parts) is acknowledged."""
     for ack in observation.acks:
         executed = integrator.executed(ack)
         if ack.seq == step.seq:
             sent = executed if executed is not None else step.sent
+            sent = sent * np.array((stretch,) * ARM_DIMS + (1,))
             return replace(step, sent=sent, lateness=ack.accepted - ack.due)
     return step
 

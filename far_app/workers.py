@@ -1,7 +1,7 @@
-"""Who runs an evaluation's blocks of scenes: this process, or several here. A cluster: far_app/ray_workers.py.
+"""Who runs an evaluation's scenes: this process, or several here. A cluster: far_app/ray_workers.py.
 
-A worker is set up once by `begin(plan)`; `work(block)` then yields a block's records, and each is handed on as soon as
-it is there.
+A worker is set up once by `begin(plan)`; `work(jobs)` then yields the records of the scenes it takes from a stream, one
+by one as it has room, and each record is handed on as soon as it is there.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import queue
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol
@@ -20,30 +20,30 @@ Record = dict[str, Any]
 """One episode's line of the results."""
 Job = tuple[int, dict[str, Record]]
 """A scene, and what is already known of it by arm."""
-Block = Sequence[Job]
 Begin = Callable[[Any], None]
-Work = Callable[[Block], Iterator[Record]]
+Work = Callable[[Iterable[Job]], Iterator[Record]]
 
 
 class Workers(Protocol):
-    """Runs blocks side by side and yields their records in any order; `begin` and `work` are importable functions."""
+    """Runs jobs side by side and yields their records in any order; `begin` and `work` are importable functions."""
 
-    def __call__(
-        self, plan: Any, blocks: Sequence[Block], count: int, begin: Begin, work: Work
-    ) -> Iterator[Record]: ...
+    def __call__(self, plan: Any, jobs: Sequence[Job], count: int, begin: Begin, work: Work) -> Iterator[Record]: ...
 
 
-def local_workers(plan: Any, blocks: Sequence[Block], count: int, begin: Begin, work: Work) -> Iterator[Record]:
-    """Workers on this machine: this process, or `count` others."""
+def local_workers(plan: Any, jobs: Sequence[Job], count: int, begin: Begin, work: Work) -> Iterator[Record]:
+    """Workers on this machine: this process, or `count` others that take from one queue."""
     if count <= 1:
         begin(plan)
-        for block in blocks:
-            yield from work(block)
+        yield from work(jobs)
         return
     context = multiprocessing.get_context("spawn")
     told: Any = context.Queue()
-    with ProcessPoolExecutor(min(count, len(blocks)), context, _begin_worker, (begin, plan, work, told)) as pool:
-        pending = {pool.submit(_work, block) for block in blocks}
+    waiting: Any = context.Queue()
+    count = min(count, len(jobs))
+    for job in [*jobs, *[None] * count]:
+        waiting.put(job)
+    with ProcessPoolExecutor(count, context, _begin_worker, (begin, plan, work, waiting, told)) as pool:
+        pending = {pool.submit(_work) for _ in range(count)}
         expected = heard = 0
         while pending or heard < expected:
             with contextlib.suppress(queue.Empty):
@@ -60,18 +60,18 @@ def local_workers(plan: Any, blocks: Sequence[Block], count: int, begin: Begin, 
                 raise
 
 
-_TELL: dict[str, Any] = {}
+_TAKE: dict[str, Any] = {}
 
 
-def _begin_worker(begin: Begin, plan: Any, work: Work, told: Any) -> None:
+def _begin_worker(begin: Begin, plan: Any, work: Work, waiting: Any, told: Any) -> None:
     begin(plan)
-    _TELL.update(work=work, told=told)
+    _TAKE.update(work=work, waiting=waiting, told=told)
 
 
-def _work(block: Block) -> int:
-    """In a worker: each record to the one who asked, as soon as it is there."""
+def _work() -> int:
+    """In a worker: scenes from the queue until its end, each record to the one who asked as soon as it is there."""
     count = 0
-    for record in _TELL["work"](block):
-        _TELL["told"].put(record)
+    for record in _TAKE["work"](iter(_TAKE["waiting"].get, None)):
+        _TAKE["told"].put(record)
         count += 1
     return count

@@ -136,10 +136,11 @@ class CameraThread:
             self._moment = moment
             self._draw(policy)
             self._look_after(view)
-            if self._anyone_watching(socket) and operator and time.monotonic() >= due:
+            if self._anyone_watching(socket) and time.monotonic() >= due:
                 due = max(due + share, time.monotonic() - share)
-                self._draw_for_operator(operator[turn])
-                turn = (turn + 1) % len(operator)
+                if operator:  # an arm without cameras still shows its status
+                    self._draw_for_operator(operator[turn])
+                    turn = (turn + 1) % len(operator)
                 if turn == 0:
                     socket.send(pack(self._view(view, moment)), zmq.NOBLOCK)
 

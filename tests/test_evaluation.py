@@ -1,6 +1,7 @@
 """The evaluation keeps what it has, refuses to mix, and runs a shared first attempt once."""
 
 import dataclasses
+import gzip
 import json
 import os
 import signal
@@ -10,7 +11,7 @@ import pytest
 
 from far_app.config import FCPAConfig, RetryConfig
 from far_app.errors import ConfigError, FarError
-from far_app.evaluation import Arm, EvaluationPlan, differences, evaluate, read_arms_file, read_results, run_block
+from far_app.evaluation import Arm, EvaluationPlan, differences, evaluate, read_arms_file, read_results, run_scenes
 from far_app.types import Attempt, Judge, Outcome, Trial
 
 PLAN = EvaluationPlan(
@@ -46,6 +47,19 @@ def test_a_second_start_does_only_what_is_missing(tmp_path):
     assert found == {(s, a) for s in (100, 101, 102) for a in ("nr", "far")}
 
 
+def test_committed_results_are_read_packed_and_go_on_from_there(tmp_path):
+    evaluate(tmp_path, dataclasses.replace(PLAN, scenes=2), 1, lambda record: None, begin, work)
+    results = tmp_path / "episodes.jsonl"
+    before = read_results(results)
+    (tmp_path / "episodes.jsonl.gz").write_bytes(gzip.compress(results.read_bytes()))
+    results.unlink()
+    assert read_results(results) == before
+    WORKED.clear()
+    evaluate(tmp_path, PLAN, 1, lambda record: None, begin, work)
+    assert WORKED == [102]
+    assert read_results(results)[: len(before)] == before
+
+
 def killed_in_scene_101(block):
     for record in work(block):
         if record["scene"] == 101:
@@ -74,17 +88,20 @@ def test_results_of_another_plan_are_refused(tmp_path):
 def test_a_first_attempt_success_is_run_once():
     calls = []
 
-    def run(arm, scenes):
-        calls.append((arm, list(scenes)))
-        for scene in scenes:
+    def run(take):
+        while (episode := take()) is not None:
+            calls.append(episode)
+            scene = episode[1]
             outcome = Outcome(success=scene == 5, judged_by=Judge.TWIN)
             attempt = Attempt(index=1, scene_seed=scene, steps=(), final=None, outcome=outcome, policy_version="base")
-            yield scene, Trial(scene_seed=scene, attempts=(attempt,), adaptations=())
+            yield episode, Trial(scene_seed=scene, attempts=(attempt,), adaptations=())
 
-    records = list(run_block([(5, {}), (6, {}), (7, {"nr": {"success": False, "attempts": 1}})], ["nr", "far"], run))
-    assert calls == [("nr", [5, 6]), ("far", [6, 7])]
-    assert [(r["arm"], r["scene"]) for r in records] == [("nr", 5), ("nr", 6), ("far", 5), ("far", 6), ("far", 7)]
-    assert [r.get("shared", False) for r in records] == [False, False, True, False, False]
+    known = [(4, {"nr": {"scene": 4, "success": True, "attempts": 1}}), (7, {"nr": {"success": False, "attempts": 1}})]
+    records = list(run_scenes([(5, {}), (6, {}), *known], ["nr", "far"], run))
+    assert calls == [("nr", 5), ("nr", 6), ("far", 6), ("far", 7)]
+    assert sorted((r["arm"], r["scene"], r.get("shared", False)) for r in records) == [
+        ("far", 4, True), ("far", 5, True), ("far", 6, False), ("far", 7, False), ("nr", 5, False), ("nr", 6, False)
+    ]  # fmt: skip
 
 
 def written(folder, text):

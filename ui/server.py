@@ -85,6 +85,7 @@ class Page:
         )
         self._viewer = LiveViewer(options.run_folder, options.recordings) if options.rerun else None
         self._plots, self._texts, self._trails, self._beats = Every(1 / 5), Every(1 / 5), Every(1 / 5), Every(1 / 2)
+        self._presence = Every(1 / 4)
         self._hw_seq = 0
 
     def _latest(self) -> tuple[Telemetry | None, Freshness]:
@@ -98,6 +99,8 @@ class Page:
         now = time.monotonic()
         heard = self._feeds.telemetry.poll()
         telemetry, fresh = self._latest()
+        if self._presence(now):
+            self._feeds.present(len(self._server.get_clients()))
         with self._server.atomic():
             self._show_view()
             if self._beats(now):

@@ -26,6 +26,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "bench adapt": ("far_app.bench.adapt", "seconds from a failed attempt to a new policy version, by stage"),
     "bench critic": ("far_app.bench.critic", "can Q rank what the policy would do: before trusting FAR with a model"),
     "bench success": ("far_app.bench.success", "a success detector against the twin's own check, on held-out attempts"),
+    "bench faults": ("far_app.bench.faults", "a real arm's faults on the fake controller: held, told, resumed"),
+    "fake-xarm": ("hw.fake_xarm.__main__", "a controller that speaks an xArm7's protocols: try a real arm's path"),
     "doctor": ("far_app.cli.doctor", "what this machine has, and what to do about what it lacks"),
 }
 

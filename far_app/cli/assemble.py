@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from far_app.learning.engines import Engine
     from far_app.learning.policy import DiffusionPolicy
     from far_app.learning.steering import Steering
+    from far_app.methods.retry import Act
 
 UNTRAINED = "untrained:"
 """--policy untrained:PRESET gives random weights."""
@@ -51,6 +52,19 @@ def checkpoints(task: str, policy: Path | None, critic: Path | None) -> tuple[Pa
     return policy or shipped(task, "policy"), critic or beside
 
 
+@dataclass(frozen=True, kw_only=True)
+class Model:
+    """A base policy and its critic, loaded once for every method that is made from them."""
+
+    network: DiffusionPolicy
+    critic: Critic | None
+    critic_file: Path | None
+    """None where the weights are random."""
+    name: str
+    act: Act
+    """Makes acting policies; the base policy is one object for all, so that trials plan together."""
+
+
 def assemble(
     method: str,
     task: TaskConfig,
@@ -68,30 +82,35 @@ def assemble(
 
         scripted = ScriptedMethod(policy.removeprefix("test:"))
         return Parts(method=scripted, policy_name=policy, max_attempts=None, another=lambda: scripted)
+    return equip(load_model(policy, critic, task.name, device, [method], engine, lanes), method, retry)
 
-    from far_app.learning.critic_file import load_demonstrations
+
+def load_model(
+    policy: str | None,
+    critic: Path | None,
+    task: str,
+    device: str,
+    methods: Sequence[str],
+    engine: Engine = "auto",
+    lanes: int | None = None,
+) -> Model:
+    """The networks that these methods need. Raises ConfigError or CheckpointError."""
     from far_app.learning.runtime import ActingPolicy
-    from far_app.methods import METHODS, Ingredients
-    from far_app.methods import method as make_method
+    from far_app.methods import METHODS
     from far_app.methods.retry import BASE_VERSION
 
-    if method not in METHODS:
-        raise ConfigError(f"unknown method '{method}'; choose one of: {', '.join(METHODS)}")
-    entry = METHODS[method]
+    if unknown := [m for m in methods if m not in METHODS]:
+        raise ConfigError(f"unknown method '{unknown[0]}'; choose one of: {', '.join(METHODS)}")
     check_device(device)
-    demonstrations = None
     if policy is not None and policy.startswith(UNTRAINED):
-        name = policy
-        network, critic_network = untrained(policy.removeprefix(UNTRAINED), task.name, device)
+        name, beside = policy, None
+        network, critic_network = untrained(policy.removeprefix(UNTRAINED), task, device)
     else:
-        path = Path(policy) if policy is not None else shipped(task.name, "policy")
-        beside = shipped(task.name, "critic") if policy is None else path.with_name("critic.safetensors")
+        path = Path(policy) if policy is not None else shipped(task, "policy")
+        beside = critic or (shipped(task, "critic") if policy is None else path.with_name("critic.safetensors"))
         name = f"shipped: {path.name}" if policy is None else str(path)
-        network, critic_network = trained(path, critic or beside, task.name, device, entry.needs_critic)
-        if (retry.fcpa.guard == "bc" or entry.needs_demonstrations) and critic_network is not None:
-            demonstrations = load_demonstrations(critic or beside, network)
-        if critic_network is not None:
-            retry = with_threshold(retry, critic or beside)
+        needed = any(METHODS[m].needs_critic for m in methods)
+        network, critic_network = trained(path, beside, task, device, needed)
     base: dict[str, ActingPolicy] = {}
 
     def act(network: DiffusionPolicy, version: str, steering: Steering | None = None) -> ActingPolicy:
@@ -103,11 +122,25 @@ def assemble(
             base[version] = policy
         return policy
 
+    return Model(network=network, critic=critic_network, critic_file=beside, name=name, act=act)
+
+
+def equip(model: Model, method: str, retry: RetryConfig) -> Parts:
+    """One method of a loaded model, with its settings. Raises ConfigError or CheckpointError."""
+    from far_app.learning.critic_file import load_demonstrations
+    from far_app.methods import METHODS, Ingredients
+    from far_app.methods import method as make_method
+
+    entry, demonstrations = METHODS[method], None
+    if model.critic is not None and model.critic_file is not None:
+        if retry.fcpa.guard == "bc" or entry.needs_demonstrations:
+            demonstrations = load_demonstrations(model.critic_file, model.network)
+        retry = with_threshold(retry, model.critic_file)
     ingredients = Ingredients(
-        network=network, critic=critic_network, config=retry, demonstrations=demonstrations, act=act
+        network=model.network, critic=model.critic, config=retry, demonstrations=demonstrations, act=model.act
     )
     return Parts(
-        method=make_method(method, ingredients), policy_name=name, max_attempts=entry.attempts,
+        method=make_method(method, ingredients), policy_name=model.name, max_attempts=entry.attempts,
         another=lambda: make_method(method, ingredients),
     )  # fmt: skip
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from tqdm import tqdm
 
-from far_app.cli.assemble import assemble, checkpoints
-from far_app.cli.lockstep_twin import LANES, lockstep_twins, trials
+from far_app.cli.assemble import checkpoints, equip, load_model
+from far_app.cli.lockstep_twin import LANES, lockstep_twins, side_by_side
 from far_app.cli.settings import Settings, parse
 from far_app.config import RetryConfig
 from far_app.errors import ConfigError
@@ -20,16 +20,17 @@ from far_app.evaluation import (
     DEV_SCENES,
     REPORT_SCENES,
     Arm,
+    Episode,
     EvaluationPlan,
     evaluate,
     read_arms_file,
     read_results,
-    run_block,
+    run_scenes,
 )
 from far_app.ray_workers import ray_workers
 from far_app.tasks import task as find_task
 from far_app.types import Trial
-from far_app.workers import Block, Workers, local_workers
+from far_app.workers import Job, Workers, local_workers
 from hw.rig import load_rig
 
 
@@ -119,20 +120,24 @@ def begin(plan: EvaluationPlan) -> None:
     torch.set_num_threads(1)
     rig = load_rig(plan.rig)
     task = dataclasses.replace(find_task(plan.task, rig.arm), max_attempts=plan.max_attempts)
-    parts = {
-        a.name: assemble(a.method, task, plan.policy, Path(plan.critic), "cpu", a.retry, lanes=LANES) for a in plan.arms
-    }
+    model = load_model(
+        plan.policy, Path(plan.critic), task.name, "cpu", [a.method for a in plan.arms], lanes=LANES
+    )  # fmt: skip
+    parts = {a.name: equip(model, a.method, a.retry) for a in plan.arms}
     images = any(p.method.policy.spec.cameras for p in parts.values())
     robots = lockstep_twins(plan.rig, task, min(LANES, plan.scenes), images)
     methods = {name: [p.another() for _ in robots] for name, p in parts.items()}
     _WORKER.update(task=task, robots=robots, methods=methods)
 
 
-def work(block: Block) -> Iterator[dict[str, Any]]:
-    """The missing records of a block of scenes."""
-    yield from run_block(block, list(_WORKER["methods"]), run_scenes)
+def work(jobs: Iterable[Job]) -> Iterator[dict[str, Any]]:
+    """The missing records of scenes."""
+    yield from run_scenes(jobs, list(_WORKER["methods"]), run_episodes)
 
 
-def run_scenes(arm: str, scenes: list[int]) -> Iterator[tuple[int, Trial]]:
-    """Trials of one arm, side by side on this worker's twins."""
-    return trials(scenes, _WORKER["robots"], _WORKER["methods"][arm], _WORKER["task"])
+def run_episodes(take: Callable[[], Episode | None]) -> Iterator[tuple[Episode, Trial]]:
+    """Trials of scenes under arms, side by side on this worker's twins."""
+    methods = _WORKER["methods"]
+    return side_by_side(
+        take, _WORKER["robots"], lambda episode, lane: (episode[1], methods[episode[0]][lane]), _WORKER["task"]
+    )

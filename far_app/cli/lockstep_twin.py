@@ -6,7 +6,8 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, TypeVar
 
 from far_app.config import TaskConfig
 from far_app.errors import RobotError
@@ -16,6 +17,10 @@ from hw.lockstep import LockstepRobot
 from hw.rig import RigConfig, load_rig
 from hw.setup import setup_of
 
+if TYPE_CHECKING:
+    from far_app.session.lockstep import Take
+
+J = TypeVar("J", bound=Hashable)
 log = logging.getLogger(__name__)
 
 LANES = 8
@@ -52,23 +57,37 @@ def trials(
     scenes: Iterable[int], robots: Sequence[LockstepRobot], methods: Sequence[Method], task: TaskConfig
 ) -> Iterator[tuple[int, Trial]]:
     """A trial of each scene, as many side by side as there are robots, each as it ends; a method for each robot."""
+    waiting = iter(scenes)
+    return side_by_side(
+        lambda: next(waiting, None), robots, lambda scene, lane: (scene, methods[lane]), task
+    )  # fmt: skip
+
+
+def side_by_side(
+    take: Take[J],
+    robots: Sequence[LockstepRobot],
+    cast: Callable[[J, int], tuple[int, Method]],
+    task: TaskConfig,
+) -> Iterator[tuple[J, Trial]]:
+    """Trials of whatever `take` hands out; `cast` names the scene of a job and its method on a lane."""
     from far_app.detectors import TwinCheck
     from far_app.session.lockstep import Advance, Lane, adapt_at_once, run_together
     from far_app.session.planners import LockstepPlanner
     from far_app.trial import TrialEvents, trial
 
-    def start(scene: int, lane: int) -> tuple[TrialEvents, Advance]:
+    def start(job: J, lane: int) -> tuple[TrialEvents, Advance]:
         robot = robots[lane]
         robot.request(Resume())
+        scene, method = cast(job, lane)
         events = trial(
-            scene, robot, LockstepPlanner(), methods[lane], TwinCheck(task.success_ticks), task, robot.scale,
-            adapt_at_once,
-        )  # fmt: skip
+            scene, robot, LockstepPlanner(), method, TwinCheck(task.success_ticks), task, robot.scale, adapt_at_once
+        )
         return events, robot.advance
 
-    def failed(lane: Lane, error: RobotError) -> Trial:
+    def failed(job: J, lane: Lane, error: RobotError) -> Trial:
         """The arm latched (it could not get home, say): the trial ends as it stands."""
-        log.warning("scene %d, %s: %s", lane.job, methods[0].name, error)
-        return Trial(scene_seed=lane.job, attempts=tuple(lane.attempts), adaptations=tuple(lane.adaptations))
+        scene, method = cast(job, 0)
+        log.warning("scene %d, %s: %s", scene, method.name, error)
+        return Trial(scene_seed=scene, attempts=tuple(lane.attempts), adaptations=tuple(lane.adaptations))
 
-    return run_together(scenes, len(robots), start, failed)
+    return run_together(take, len(robots), start, failed)

@@ -9,12 +9,14 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import http.client
+import math
 import os
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from far_app.cli.assemble import Parts, assemble, check_observation
 from far_app.cli.detector import learned_detector
@@ -42,12 +44,18 @@ from far_app.session.statistics import LoopStatistics
 from far_app.tasks import supervised
 from far_app.tasks import task as find_task
 from hw.camera_config import with_views
-from hw.rig import RigConfig, load_rig
+from hw.rig import RigConfig
 from hw.setup import setup_of
 
 HARDWARE_PATIENCE = 180.0
 """Seconds for the hw server's first observation (a first start compiles for a while)."""
 PAGE_PATIENCE = 60.0
+COUNTDOWN = 3.0
+"""Seconds for which a real arm's attempts are announced."""
+PAGE_SILENCE = 2.0
+"""Seconds without a page that someone looks at after which a real arm is held."""
+FIRST_STRETCH = 2
+"""Ticks that each tick of a session's first attempt takes on a real arm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +83,17 @@ class Stage:
                 config={"run": dataclasses.asdict(options), "task": dataclasses.asdict(self.task)},
             ),
         )  # fmt: skip
+
+    def _hardware_rules(self) -> dict[str, Any]:
+        """What a session on a real arm has that one on the twin has not."""
+        if self.rig.robot != "xarm":
+            return {}
+        watched = self.page is not None
+        return {
+            "countdown": COUNTDOWN if watched else 0.0, "await_scene": watched,
+            "page_silence": PAGE_SILENCE if watched else math.inf,
+            "first_stretch": 1 if self.options.full_speed else FIRST_STRETCH,
+        }  # fmt: skip
 
     @contextlib.contextmanager
     def detector(self) -> Iterator[SuccessDetector]:
@@ -106,7 +125,7 @@ class Stage:
                 session = Session(
                     settings=SessionSettings(
                         name=writer.folder.name, trials=options.trials, seed=options.seed, headless=options.headless,
-                        adaptation_limit=options.retry.adaptation_limit,
+                        adaptation_limit=options.retry.adaptation_limit, **self._hardware_rules(),
                     ),
                     robot=robot, planner=ThreadedPlanner(), method=method or self.parts.method,
                     detector=detector, task=self.task, scale=self.rig.scale_for(self.task),
@@ -123,14 +142,14 @@ class Stage:
 @contextlib.contextmanager
 def stage(options: RunOptions) -> Iterator[Stage]:
     """Start everything, wait until it is ready, end everything. Raises the FarError of whatever cannot start."""
-    rig = load_rig(options.rig, options.task)
+    rig = options.load_rig()
     task = with_views(find_task(options.task, rig.arm), rig.cameras)
     task = task if rig.robot == "twin" else supervised(task)
-    port = 0 if options.headless else choose_port(options.host, options.port)
+    port = 0 if options.headless else choose_port(options.page_host, options.port)
     with run_folder() as folder, contextlib.ExitStack() as stack:
         family = Family()
         stack.callback(family.end)
-        hardware = family.add(start_hardware(folder, options.rig, options.task))
+        hardware = family.add(start_hardware(folder, options.rig_file, options.task, options.host))
         page = None if options.headless else family.add(start_page(folder, options, port, task.cameras))
         parts = assemble(
             options.method, task, options.policy, options.critic, options.device, options.retry, options.engine
@@ -143,7 +162,7 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         stack.callback(nice, 0)
         robot = stack.enter_context(connected(folder, hardware))
         if page is not None:
-            wait_for_page(page, options.host, port)
+            wait_for_page(page, options.page_host, port)
         check_observation(parts.method.policy.spec, robot.observe())
         preflight(
             parts.method.policy.spec, policy_card(task.name, options.policy), setup_of(rig, task), robot.observe(),
@@ -154,17 +173,18 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         yield Stage(
             options=options, task=task, rig=rig, parts=parts, robot=robot, folder=folder, family=family,
             hardware=hardware, page=page,
-            page_url=f"http://{options.host}:{port}" if page is not None else "",
+            page_url=f"http://{options.page_host}:{port}" if page is not None else "",
         )  # fmt: skip
 
 
-def start_hardware(folder: Path, rig: str, task: str) -> Child:
+def start_hardware(folder: Path, rig: str, task: str, address: str) -> Child:
     arguments = ["--folder", str(folder), "--rig", rig, "--task", task, "--parent", str(os.getpid())]
+    arguments += ["--address", address] * bool(address)
     return Child("hardware", "hw.server", arguments, folder)
 
 
 def start_page(folder: Path, options: RunOptions, port: int, cameras: Sequence[str]) -> Child:
-    arguments = ["--run-folder", str(folder), "--host", options.host, "--port", str(port)]
+    arguments = ["--run-folder", str(folder), "--host", options.page_host, "--port", str(port)]
     arguments += ["--cameras", *cameras, "--recordings", str(options.recordings.absolute())]
     arguments += ["--no-scene3d"] * (not options.scene3d) + ["--no-rerun"] * (not options.rerun)
     return Child("page", "ui.server", arguments, folder)

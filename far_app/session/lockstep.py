@@ -5,8 +5,9 @@ Called by tests, benchmarks and evaluations; the robot lives in the same process
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from far_app.errors import RobotError
 from far_app.protocols import Method, PlanRequest
@@ -22,7 +23,6 @@ Advance = Callable[[], float]
 class Lane:
     """A trial that is under way, alone or beside others."""
 
-    job: int
     events: TrialEvents
     advance: Advance
     answer: float | ActionChunk | None = None
@@ -52,42 +52,44 @@ class Lane:
 
 def run_lockstep(events: TrialEvents, advance: Advance) -> Trial:
     """Drive one trial to its end."""
-    lane = Lane(0, events, advance)
+    lane = Lane(events, advance)
     while isinstance(outcome := lane.step(), PlanRequest):
         lane.answer = plan_one(outcome)
     return outcome
 
 
-Start = Callable[[int, int], tuple[TrialEvents, Advance]]
+J = TypeVar("J", bound=Hashable)
+Take = Callable[[], J | None]
+"""The next job; None while there is none (one that ends may bring more)."""
+Start = Callable[[J, int], tuple[TrialEvents, Advance]]
 """(job, lane) → its trial, on that lane's robot."""
 
 
 def run_together(
-    jobs: Iterable[int], lanes: int, start: Start, failed: Callable[[Lane, RobotError], Trial]
-) -> Iterator[tuple[int, Trial]]:
+    take: Take[J], lanes: int, start: Start[J], failed: Callable[[J, Lane, RobotError], Trial]
+) -> Iterator[tuple[J, Trial]]:
     """Drive many trials side by side, each lane one after the other, so that they share batches of inference. Yields
-    each as it ends; `failed` makes a Trial of one whose robot gave up."""
-    waiting = iter(jobs)
-    running: dict[int, Lane] = {}
+    each as it ends, until none runs and there is no job; `failed` makes a Trial of one whose robot gave up."""
+    running: dict[int, tuple[J, Lane]] = {}
     while True:
         for number in range(lanes):
-            if number not in running and (job := next(waiting, None)) is not None:
-                running[number] = Lane(job, *start(job, number))
+            if number not in running and (job := take()) is not None:
+                running[number] = job, Lane(*start(job, number))
         if not running:
             return
         requests: dict[int, PlanRequest] = {}
-        for number, lane in list(running.items()):
+        for number, (job, lane) in list(running.items()):
             try:
                 outcome = lane.step()
             except RobotError as error:
-                outcome = failed(lane, error)
+                outcome = failed(job, lane, error)
             if isinstance(outcome, PlanRequest):
                 requests[number] = outcome
             else:
                 del running[number]
-                yield lane.job, outcome
+                yield job, outcome
         for number, chunk in plan_together(requests).items():
-            running[number].answer = chunk
+            running[number][1].answer = chunk
 
 
 class FinishedAdaptation:

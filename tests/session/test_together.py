@@ -27,8 +27,13 @@ def begun(scene: int, lane: int = 0):
     return events, lambda: 1000.0 + next(clock) / 30
 
 
-def failed(lane, error) -> Trial:
-    return Trial(scene_seed=lane.job, attempts=tuple(lane.attempts), adaptations=tuple(lane.adaptations))
+def failed(scene, lane, error) -> Trial:
+    return Trial(scene_seed=scene, attempts=tuple(lane.attempts), adaptations=tuple(lane.adaptations))
+
+
+def of(jobs):
+    waiting = iter(jobs)
+    return lambda: next(waiting, None)
 
 
 def facts(result: Trial):
@@ -36,7 +41,7 @@ def facts(result: Trial):
 
 
 def test_every_trial_ends_as_it_would_alone():
-    together = dict(run_together(range(5), 3, begun, failed))
+    together = dict(run_together(of(range(5)), 3, begun, failed))
     assert sorted(together) == list(range(5))
     for scene, result in together.items():
         assert facts(result) == facts(run_lockstep(*begun(scene)))
@@ -56,6 +61,16 @@ def test_a_robot_that_gives_up_ends_its_own_trial_only():
 
         return events, tired
 
-    together = dict(run_together(range(3), 2, start, failed))
+    together = dict(run_together(of(range(3)), 2, start, failed))
     assert not together[1].success and len(together[1].attempts) < 3
     assert np.all([facts(together[s]) == facts(run_lockstep(*begun(s))) for s in (0, 2)])
+
+
+def test_an_end_may_bring_more_jobs():
+    jobs = [0, 1]
+    ended = []
+    for scene, _ in run_together(lambda jobs=jobs: jobs.pop(0) if jobs else None, 2, begun, failed):
+        ended.append(scene)
+        if scene == 1:
+            jobs += [3, 4]
+    assert sorted(ended) == [0, 1, 3, 4]
