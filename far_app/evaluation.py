@@ -203,12 +203,16 @@ def packed_results(path: Path) -> Path:
 
 
 def prepare(folder: Path, plan: EvaluationPlan) -> dict[int, dict[str, dict[str, Any]]]:
-    """What a folder already holds, by scene and arm; ConfigError when it is another plan's."""
+    """What a folder already holds, by scene and arm; ConfigError when it is another plan's. A plan may have grown by
+    arms: what there is of the others stays."""
     folder.mkdir(parents=True, exist_ok=True)
-    note = folder / "plan.json"
-    if note.exists() and json.loads(note.read_text()) != plan.fingerprint():
-        raise ConfigError(f"{folder} holds results of another plan ({note}); give another --out or delete it")
-    note.write_text(json.dumps(plan.fingerprint(), indent=1))
+    note, here = folder / "plan.json", plan.fingerprint()
+    if note.exists():
+        there = json.loads(note.read_text())
+        lost = [a for a in there.pop("arms", ()) if a not in here["arms"]]
+        if lost or there != {k: v for k, v in here.items() if k != "arms"}:
+            raise ConfigError(f"{folder} holds results of another plan ({note}); give another --out or delete it")
+    note.write_text(json.dumps(here, indent=1))
     found: dict[int, dict[str, dict[str, Any]]] = {}
     for record in read_results(folder / "episodes.jsonl"):
         found.setdefault(record["scene"], {})[record["arm"]] = record

@@ -85,6 +85,16 @@ def test_results_of_another_plan_are_refused(tmp_path):
     assert json.loads((tmp_path / "plan.json").read_text())["max_attempts"] == 2
 
 
+def test_a_plan_may_grow_by_an_arm_but_not_change_one(tmp_path):
+    evaluate(tmp_path, dataclasses.replace(PLAN, arms=PLAN.arms[:1]), 1, lambda record: None, begin, work)
+    WORKED.clear()
+    evaluate(tmp_path, PLAN, 1, lambda record: None, begin, work)
+    assert [a["name"] for a in json.loads((tmp_path / "plan.json").read_text())["arms"]] == ["nr", "far"]
+    changed = Arm(name="far", method="far", retry=RetryConfig(fcpa=FCPAConfig(lr=1e-3)))
+    with pytest.raises(ConfigError, match="another plan"):
+        evaluate(tmp_path, dataclasses.replace(PLAN, arms=(PLAN.arms[0], changed)), 1, print, begin, work)
+
+
 def test_a_first_attempt_success_is_run_once():
     calls = []
 
