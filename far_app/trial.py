@@ -21,6 +21,7 @@ from typing import Protocol
 import numpy as np
 
 from far_app.aggregation import Plan
+from far_app.alarm import Alarm, NoAlarm
 from far_app.config import TaskConfig
 from far_app.motion import ActionScale, TargetIntegrator
 from far_app.protocols import Heartbeat, Hold, Home, Method, Planner, PlanRequest, Reset, Robot, SuccessDetector
@@ -37,6 +38,8 @@ from far_app.types import (
     Step,
     Trial,
 )
+
+NO_ALARM = NoAlarm()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,6 +109,7 @@ def trial(
     scale: ActionScale,
     start_adaptation: StartAdaptation,
     stretch: int = 1,
+    alarm: Alarm = NO_ALARM,
 ) -> TrialEvents:
     """Algorithm 1. Returns the trial's attempts and adaptations; afterwards the method holds the base policy again."""
     attempts: list[Attempt] = []
@@ -116,7 +120,9 @@ def trial(
     for i in range(1, task.max_attempts + 1):
         yield AttemptStarted(attempt_index=i, policy_version=method.policy.version)
         slowly = stretch if i == 1 else 1
-        attempt = yield from execute(robot, planner, method, detector, task, scale, scene_seed, i, slowly)
+        attempt = yield from execute(
+            robot, planner, method, detector, task, scale, scene_seed, i, slowly, alarm
+        )  # fmt: skip
         attempts.append(attempt)
         last = attempt.outcome.success or i == task.max_attempts
         yield AttemptEnded(attempt=attempt, last=last)
@@ -140,6 +146,7 @@ def execute(
     scene_seed: int,
     index: int,
     stretch: int = 1,
+    alarm: Alarm = NO_ALARM,
 ) -> Generator[Event, float | ActionChunk | None, Attempt]:
     """One attempt. A tick: observe → judge → chunk → aggregate → perturb → target.
 
@@ -151,6 +158,7 @@ def execute(
     steps: list[Step] = []
     step: Step | None = None
     detector.begin()
+    alarm.begin()
     planner.begin(method.policy)
     integrator = TargetIntegrator(scale, robot.observe().eef)
 
@@ -163,7 +171,7 @@ def execute(
         if isinstance(deadline, AfterHold):
             plan, integrator = Plan(horizon=spec.horizon), TargetIntegrator(scale, observation.eef)
             history.clear()
-        outcome = detector.judge(observation) or fault(observation)
+        outcome = detector.judge(observation) or fault(observation) or alarm.judge(plan, t)
         if outcome is not None or t == task.horizon:
             break
 

@@ -1,4 +1,4 @@
-"""The learned success detector of `far run --detector`, put together with the policy's encoder."""
+"""`far run --detector` and `--alarm`: what was learnt or calibrated for a policy, put together with it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from far_app.alarm import Alarm, FailureAlarm, read_limits
 from far_app.cli.assemble import checkpoints
 from far_app.protocols import SuccessDetector
+from far_app.trial import NO_ALARM
 
 if TYPE_CHECKING:
     from far_app.cli.options import RunOptions
@@ -30,3 +32,13 @@ def learned_detector(options: RunOptions, wait: float) -> Iterator[SuccessDetect
         yield detector
     finally:
         detector.close()
+
+
+def failure_alarm(options: RunOptions) -> Alarm:
+    """The early failure alarm that was asked for. Raises ConfigError or CheckpointError."""
+    if options.alarm is None:
+        return NO_ALARM
+    from far_app.learning.policy import fingerprint, load_policy
+
+    path, _ = checkpoints(options.task, Path(options.policy) if options.policy else None, None)
+    return FailureAlarm(read_limits(options.alarm, fingerprint(load_policy(path, options.task))))

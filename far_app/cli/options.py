@@ -63,6 +63,8 @@ class RunOptions:
     """Settings of the method."""
     detector: Path | None = None
     """Success detector (`far train success`) in place of the twin's own check or a person."""
+    alarm: Path | None = None
+    """Early failure alarm (`far train alarm`): ends attempts that get nowhere before their horizon."""
     judge_wait: float = 30.0
     """Seconds to wait for your word on an attempt that nobody could judge; then it is a failure. Headless: none."""
     shadow: bool = False

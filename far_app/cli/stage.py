@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from far_app.cli.assemble import Parts, assemble, check_observation
-from far_app.cli.detector import learned_detector
+from far_app.cli.detector import failure_alarm, learned_detector
 from far_app.cli.options import RunOptions
 from far_app.cli.ports import choose_port
 from far_app.cli.preflight import policy_card, preflight
@@ -130,6 +130,7 @@ class Stage:
                     robot=robot, planner=ThreadedPlanner(), method=method or self.parts.method,
                     detector=detector, task=self.task, scale=self.rig.scale_for(self.task),
                     recorder=Recorder(writer), inbox=inbox, statistics=statistics, publisher=publisher,
+                    alarm=failure_alarm(options),
                 )  # fmt: skip
                 if options.shadow:
                     session.supervision.say("shadow run: plans are shown, the arm is held", "warning")

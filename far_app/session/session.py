@@ -13,6 +13,7 @@ import math
 import time
 from dataclasses import dataclass, field, replace
 
+from far_app.alarm import Alarm
 from far_app.config import TaskConfig
 from far_app.detectors import OperatorOverride
 from far_app.errors import RobotError
@@ -32,7 +33,17 @@ from far_app.session.statistics import LoopStatistics
 from far_app.session.supervision import Freshness, Supervision, TrialAbandoned
 from far_app.session.watched import WatchedRobot
 from far_app.session_states import Happening, State
-from far_app.trial import Adapted, AfterHold, AttemptEnded, AttemptStarted, Event, RunningAdaptation, Tick, trial
+from far_app.trial import (
+    NO_ALARM,
+    Adapted,
+    AfterHold,
+    AttemptEnded,
+    AttemptStarted,
+    Event,
+    RunningAdaptation,
+    Tick,
+    trial,
+)
 from far_app.types import Adaptation, Attempt, Step, Trial
 
 log = logging.getLogger(__name__)
@@ -89,8 +100,9 @@ class Session:
         inbox: IntentInbox,
         statistics: LoopStatistics,
         publisher: TelemetryPublisher | None = None,
+        alarm: Alarm = NO_ALARM,
     ) -> None:
-        self.settings, self.task, self.scale = settings, task, scale
+        self.settings, self.task, self.scale, self.alarm = settings, task, scale, alarm
         self.planner, self.method, self.recorder, self.statistics = planner, method, recorder, statistics
         self.robot = WatchedRobot(robot, statistics)
         self.detector = OperatorOverride(detector)
@@ -157,7 +169,7 @@ class Session:
         self._stretch = self.settings.first_stretch if number == 1 else 1
         events = trial(
             seed, self.robot, self.planner, self.method, self.detector, self.task, self.scale, self._start_adaptation,
-            self._stretch,
+            self._stretch, self.alarm,
         )  # fmt: skip
         answer: float | None = None
         try:
