@@ -21,6 +21,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "inspect": ("far_app.cli.inspect", "what a recorded session holds, and what is missing or damaged"),
     "replay": ("far_app.cli.replay", "open a recorded attempt or session in the rerun viewer"),
     "export": ("far_app.cli.export", "recorded attempts as a LeRobot, robomimic or rerun dataset"),
+    "import": ("far_app.cli.import_demos", "robomimic or LeRobot demonstrations as ours"),
     "bench loop": ("far_app.bench.loop", "lateness of the 30 Hz loop, idle and adapting"),
     "bench infer": ("far_app.bench.infer", "milliseconds per chunk, by preset"),
     "bench adapt": ("far_app.bench.adapt", "seconds from a failed attempt to a new policy version, by stage"),

@@ -12,10 +12,12 @@ from typing import Literal
 import tyro
 
 from far_app.errors import ConfigError
-from far_app.exchange.select import Only, Selection, rollouts
+from far_app.exchange.rrd import write_rrds
+from far_app.exchange.select import Only, Selection, chosen, rollouts
 from far_app.recording.inspect import find_session
 from far_app.recording.reader import read_session
 from far_app.recording.schema import SessionInfo
+from far_app.tasks import task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,23 +60,36 @@ def main(arguments: Sequence[str]) -> int:
         check_alike(sessions, infos)
         count = write_lerobot(
             options.out, rollouts(sessions, selection, say), infos[0].rate, robot_name(infos[0]),
-            lambda task: options.instruction or task, options.overwrite,
+            lambda name: options.instruction or name, options.overwrite,
         )  # fmt: skip
+    elif options.to == "robomimic":
+        from far_app.exchange.robomimic import write_robomimic
+
+        check_alike(sessions, infos)
+        count = write_robomimic(options.out, rollouts(sessions, selection, say), env_args(infos[0]), options.overwrite)
     else:
-        raise ConfigError(f"--to {options.to} is not there yet")
+        from ui.rerun_views import attempt_to_rrd
+
+        count = write_rrds(options.out, chosen(sessions, selection, say), attempt_to_rrd, options.overwrite)
     print(f"{options.out}: {count} episodes{f', {len(left_out)} remarks above' if left_out else ''}")
     return 0
 
 
 def check_alike(sessions: Sequence[Path], infos: Sequence[SessionInfo]) -> None:
-    """ConfigError when two sessions run at different rates or on different robots."""
+    """ConfigError when two sessions are of different tasks, or run at different rates or on different robots."""
+
+    def words(info: SessionInfo) -> str:
+        return f"'{info.task}' on a {robot_name(info)} at {info.rate:g} Hz"
+
     for path, info in zip(sessions, infos, strict=True):
-        here, first = (info.rate, robot_name(info)), (infos[0].rate, robot_name(infos[0]))
-        if here != first:
-            raise ConfigError(
-                f"{path} is of a {here[1]} at {here[0]:g} Hz, {sessions[0]} of a {first[1]} at {first[0]:g} Hz; "
-                "export them apart"
-            )
+        if words(info) != words(infos[0]):
+            raise ConfigError(f"{path} is of {words(info)}, {sessions[0]} of {words(infos[0])}; export them apart")
+
+
+def env_args(info: SessionInfo) -> dict[str, object]:
+    """Where the episodes come from, as robomimic has it (and `far demo` writes it)."""
+    environment = info.config.get("task", {}).get("environment") or task(info.task).environment
+    return {"env_name": environment, "type": 1, "env_kwargs": {"robots": robot_name(info), "rig": dict(info.rig)}}
 
 
 def robot_name(info: SessionInfo) -> str:
