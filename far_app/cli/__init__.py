@@ -17,7 +17,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "eval": ("far_app.cli.evaluate", "compare ways to retry, in lockstep, over many scenes"),
     "study": ("far_app.cli.study", "tasks × training seeds × methods from one file: models, episodes, tables"),
     "improve": ("far_app.cli.improve", "collect with retries, learn from successes and failures, again and again"),
-    "report": ("far_app.cli.report", "tables with intervals and tests, and a picture, of a folder of results"),
+    "report": (
+        "far_app.cli.report",
+        "tables and a picture of results, or a page on recorded sessions",
+    ),
     "inspect": ("far_app.cli.inspect", "what a recorded session holds, and what is missing or damaged"),
     "replay": ("far_app.cli.replay", "open a recorded attempt or session in the rerun viewer"),
     "export": ("far_app.cli.export", "recorded attempts as a LeRobot, robomimic or rerun dataset"),

@@ -25,6 +25,8 @@ CAMERAS = {
     "front": (*(v3.IMAGE + name for name in ("front", "image", "top", "agentview")), "observation.image"),
     "wrist": (*(v3.IMAGE + name for name in ("wrist", "wrist_image", "image2", "hand")), "observation.wrist_image"),
 }
+SUCCESS, REWARD = ("far.task_success", "next.success"), ("far.reward", "next.reward")
+"""Ours are of the observation itself."""
 _DAMAGE = (OSError, KeyError, ValueError, pa.ArrowException, RecordingError)
 
 
@@ -70,7 +72,9 @@ def _info(root: Path) -> dict[str, Any]:
                 f"{root} is a LeRobotDataset {version}, this program reads v3; convert it with LeRobot's "
                 "lerobot.datasets.v30.convert_dataset_v21_to_v30"
             )
-        info["features"], info["data_path"]
+        missing = {"features", "data_path", "fps"} - set(info)
+        if missing:
+            raise ValueError(f"{', '.join(sorted(missing))} missing")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{root} is no LeRobotDataset v3: {v3.INFO} cannot be read ({error!r})") from error
     return info
@@ -155,8 +159,8 @@ def _episode(
     column = {name: column_array(table[name]) for name in table.column_names if name != "task" and name not in images
               and not pa.types.is_struct(table.schema.field(name).type)}  # fmt: skip
     count = len(table)
-    success = column.get("far.task_success", column.get("next.success", np.arange(count) == count - 1)).astype(bool)
-    reward = column.get("far.reward", column.get("next.reward", success.astype(np.float32))).astype(np.float32)
+    success = next((column[name] for name in SUCCESS if name in column), np.arange(count) == count - 1).astype(bool)
+    reward = next((column[name] for name in REWARD if name in column), success).astype(np.float32)
     actions = foreign.actions(column[v3.ACTION], f"{root} {v3.ACTION}")
     states, objects = column[v3.STATE].astype(np.float32), column.get("far.objects")
     if final is not None:
