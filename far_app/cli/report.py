@@ -28,14 +28,15 @@ class ReportOptions:
 
 def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(ReportOptions, args=list(arguments), prog="far report")
-    if not options.folders:
+    folders = list(options.folders)
+    if not folders:
         raise ConfigError("nothing to report on; give a folder of far eval's results, or recorded sessions")
-    if any(results_in(folder) for folder in options.folders):
-        if len(options.folders) > 1:
+    if any(results_in(folder) for folder in folders):
+        if len(folders) > 1:
             raise ConfigError("one folder of results at a time; several recorded sessions can share a page")
-        print(write_report(options.folders[0], options.out or options.folders[0]))
+        print(write_report(folders[0], options.out or folders[0]))
     else:
-        print(write_page(options.folders, options.out, options.overwrite))
+        print(write_page(folders, options.out, options.overwrite))
     return 0
 
 

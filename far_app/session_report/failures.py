@@ -126,7 +126,7 @@ def curve(known: Blame) -> str:
 
     shades = "".join(shade(tick, "flagged") for tick in known.flagged)
     shades += shade(known.worst, "worst") if known.worst is not None else ""
-    points = " ".join(f"{x(t):.1f},{y(values[t]):.1f}" for t in np.flatnonzero(finite))
+    points = " ".join(f"{x(t):.1f},{y(values[t]):.1f}" for t in range(len(values)) if finite[t])
     return (
         f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="V over ticks">{shades}'
         f'<polyline points="{points}"/><text x="{edge}" y="14">V(s) {high:.2f}</text>'
