@@ -42,6 +42,8 @@ def main(arguments: Sequence[str]) -> int:
 
 def results_in(folder: Path) -> bool:
     """Whether `far eval` or `far study` wrote it."""
+    if (folder / "session.json").exists():
+        return False
     return (folder / "plan.json").exists() or any(folder.glob("*/plan.json"))
 
 
