@@ -9,6 +9,7 @@ from pathlib import Path
 from far_app.errors import ConfigError
 from far_app.exchange.select import Chosen
 from far_app.exchange.target import whole
+from far_app.recording.reader import AttemptRecording
 from far_app.recording.replay import WriteRrd
 
 
@@ -21,9 +22,19 @@ def write_rrds(path: Path, attempts: Iterable[Chosen], write_rrd: WriteRrd, over
             header = one.recording.header
             assert header is not None
             name = f"{one.session.header.session}_trial_{header.trial:04d}_attempt_{header.attempt}.rrd"
-            recording = replace(one.recording, steps=one.recording.steps[one.first :]) if one.first else one.recording
-            write_rrd(recording, half / name)
+            write_rrd(from_tick(one.recording, one.first), half / name)
             count += 1
         if not count:
             raise ConfigError("no attempt to export; far inspect lists what the sessions hold, --only filters it")
     return count
+
+
+def from_tick(recording: AttemptRecording, first: int) -> AttemptRecording:
+    """The same without its first steps; what was learnt from it moves along, for it counts from the first step."""
+    lesson = recording.adaptation
+    if lesson is not None:
+        lesson = replace(
+            lesson, values=lesson.values[first:], value_changes=lesson.value_changes[first:],
+            flagged=tuple(tick - first for tick in lesson.flagged if tick >= first),
+        )  # fmt: skip
+    return replace(recording, steps=recording.steps[first:], adaptation=lesson) if first else recording

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -15,7 +16,10 @@ from far_app.exchange.feature_stats import STATISTICS, array_stats, histogram, i
 from far_app.learning.dataset import Episode, read_episodes
 from far_app.recording.episodes import session_episodes
 from far_app.recording.reader import read_session
-from tests.recording import sessions
+from far_app.recording.schema import SessionInfo
+from far_app.recording.writer import SessionWriter
+from far_app.types import Observation
+from tests.recording import sessions, values
 
 CAMERAS = ("front", "wrist")
 
@@ -135,3 +139,32 @@ def test_robomimic_holds_what_its_loader_asks_for(robomimic):
         np.testing.assert_array_equal(demo["obs/robot0_eef_pos"][1:], demo["next_obs/robot0_eef_pos"][:-1])
         assert list(file["mask/successes"]) == list(file["mask/recoveries"]) == [b"demo_1"]
         assert list(file["mask/failures"]) == [b"demo_0"]
+
+
+def bare_session(root: Path) -> Path:
+    """As on hardware under a policy without cameras: no pictures, no objects, nobody's own check of the task."""
+    writer = SessionWriter(root, SessionInfo(task="lift", method="nr"), space_to_start=0, space_to_go_on=0)
+    writer.begin_trial(1, 7)
+    writer.begin_attempt(1, "base")
+    whole = values.attempt(1, 4, success=True)
+
+    def bare(o: Observation) -> Observation:
+        return replace(o, images={}, objects={}, success=None, reward=0.0)
+
+    steps = tuple(replace(s, observation=bare(s.observation), success=None, value=float("nan")) for s in whole.steps)
+    writer.end_attempt(replace(whole, steps=steps, final=bare(whole.final)))
+    writer.end_trial(success=True, attempts=1)
+    writer.close()
+    return writer.folder
+
+
+@pytest.mark.parametrize("to", ["lerobot", "robomimic"])
+def test_a_session_without_cameras_or_objects_comes_back_too(to, tmp_path):
+    folder, out, back = bare_session(tmp_path / "r"), tmp_path / "out", tmp_path / "demos.hdf5"
+    assert main(["export", str(folder), "--to", to, "--out", str(out)]) == 0
+    assert main(["import", str(out), "--out", str(back)]) == 0
+    [ours], [theirs] = session_episodes(folder, "lift"), read_episodes(back, ())
+    assert theirs.images == {} and theirs.objects is None and theirs.success
+    for name in ("states", "actions", "rewards", "successes"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+    assert theirs.successes.tolist() == [False] * 4 + [True], "the operator's success counts from the last tick"

@@ -11,8 +11,9 @@ import pytest
 
 from far_app.cli import main
 from far_app.errors import ConfigError
-from far_app.exchange.rrd import write_rrds
+from far_app.exchange.rrd import from_tick, write_rrds
 from far_app.exchange.select import Selection, chosen, rollouts, start_of, wanted
+from far_app.recording.reader import read_attempt
 from far_app.types import Judge, Outcome
 from tests.recording import sessions, values
 
@@ -123,3 +124,12 @@ def test_rrd_draws_each_chosen_attempt_from_its_first_tick(tmp_path):
     assert count == 1 and drawn == [(f"{session.name}_trial_0001_attempt_2.rrd", 4)]
     with pytest.raises(ConfigError, match="no attempt to export"):
         write_rrds(tmp_path / "none", chosen([session], Selection(only="human"), quiet), draw, False)
+
+
+def test_a_segments_blame_stays_with_its_steps(tmp_path):
+    recording = read_attempt(sessions.small_session(tmp_path, steps=12) / "trial_0001/attempt_1.mcap")
+    later = from_tick(recording, 4)
+    assert later.adaptation is not None and recording.adaptation is not None
+    assert later.steps[0].tick == 4 and later.adaptation.flagged == (0, 1)
+    assert later.adaptation.value_changes[0] == recording.adaptation.value_changes[4]
+    assert from_tick(recording, 0) is recording
