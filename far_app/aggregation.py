@@ -7,7 +7,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from far_app.types import ActionChunk
+from far_app.types import ARM_DIMS, ActionChunk
 
 
 class Plan:
@@ -33,6 +33,15 @@ class Plan:
         self._chunks = {k: c for k, c in self._chunks.items() if tick < k + self.horizon}
         predictions = [c.actions[tick - k] for k, c in self._chunks.items() if k <= tick]
         return np.mean(predictions, axis=0) if predictions else None
+
+    def spread(self, tick: int) -> float:
+        """How far the chunks disagree on tick t: root mean square distance of their arm actions from the mean; NaN with
+        fewer than two."""
+        reaching = [c.actions[tick - k, :ARM_DIMS] for k, c in self._chunks.items() if k <= tick < k + self.horizon]
+        if len(reaching) < 2:
+            return math.nan
+        actions = np.stack(reaching)
+        return float(np.sqrt(((actions - actions.mean(0)) ** 2).sum(1).mean()))
 
     def value(self, tick: int) -> float:
         """V(s_t) when the chunk of this very tick is here, else NaN."""

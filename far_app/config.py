@@ -114,11 +114,18 @@ class FCPAConfig:
     accumulate: bool = True
     """Start from the trial's adapted weights (paper, Algorithm 1); False restarts from the base with all of the
     trial's pairs."""
+    hedge: bool = False
+    """Every other retry acts with the base policy (False is the paper): a retry that failed for all it had learnt is
+    evidence against the lesson, and where failures are chance a plain second try is the better one. A bad lesson then
+    costs one attempt and not the trial. Needs accumulate = false."""
 
     def __post_init__(self) -> None:
         _check(self.steps >= 0, "fcpa.steps", self.steps, "at least 0")
         _check(self.lr > 0, "fcpa.lr", self.lr, "above 0")
         _check(self.draws >= 1, "fcpa.draws", self.draws, "at least 1")
+        _check(
+            not (self.hedge and self.accumulate), "fcpa.accumulate", self.accumulate, "false when fcpa.hedge is true"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,6 +205,9 @@ class TaskConfig:
     """Consecutive ticks for which the twin's own check must hold."""
     max_attempts: int = 5
     """N (paper: 5 in simulation, 3 on the real arm)."""
+    judge: Literal["twin", "person"] = "twin"
+    """Who says that it succeeded where no learned detector does: the twin's own check, or a person (paper, Real-world
+    Experiments: by human inspection)."""
     rate: float = 30.0
     """Policy ticks a second."""
     placement: tuple[float, float] | None = None

@@ -7,6 +7,7 @@ identical for every method: a scene solved at the first attempt is solved for al
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import hashlib
 import json
 import tomllib
@@ -178,11 +179,17 @@ def run_scenes(
 
 
 def read_results(path: Path) -> list[dict[str, Any]]:
-    """Whole lines of a results file; a torn last line (a killed run) is left out."""
-    if not path.exists():
+    """Whole lines of a results file, or of its gzip where only that is there; a torn last line (a killed run) is left
+    out."""
+    packed = packed_results(path)
+    if path.exists():
+        text = path.read_text()
+    elif packed.exists():
+        text = gzip.decompress(packed.read_bytes()).decode()
+    else:
         return []
     records = []
-    for line in path.read_text().splitlines():
+    for line in text.splitlines():
         try:
             records.append(json.loads(line))
         except json.JSONDecodeError:
@@ -190,13 +197,22 @@ def read_results(path: Path) -> list[dict[str, Any]]:
     return records
 
 
+def packed_results(path: Path) -> Path:
+    """Results as they are committed: `gzip -9n episodes.jsonl`."""
+    return path.with_name(path.name + ".gz")
+
+
 def prepare(folder: Path, plan: EvaluationPlan) -> dict[int, dict[str, dict[str, Any]]]:
-    """What a folder already holds, by scene and arm; ConfigError when it is another plan's."""
+    """What a folder already holds, by scene and arm; ConfigError when it is another plan's. A plan may have grown by
+    arms: what there is of the others stays."""
     folder.mkdir(parents=True, exist_ok=True)
-    note = folder / "plan.json"
-    if note.exists() and json.loads(note.read_text()) != plan.fingerprint():
-        raise ConfigError(f"{folder} holds results of another plan ({note}); give another --out or delete it")
-    note.write_text(json.dumps(plan.fingerprint(), indent=1))
+    note, here = folder / "plan.json", plan.fingerprint()
+    if note.exists():
+        there = json.loads(note.read_text())
+        lost = [a for a in there.pop("arms", ()) if a not in here["arms"]]
+        if lost or there != {k: v for k, v in here.items() if k != "arms"}:
+            raise ConfigError(f"{folder} holds results of another plan ({note}); give another --out or delete it")
+    note.write_text(json.dumps(here, indent=1))
     found: dict[int, dict[str, dict[str, Any]]] = {}
     for record in read_results(folder / "episodes.jsonl"):
         found.setdefault(record["scene"], {})[record["arm"]] = record
@@ -214,6 +230,8 @@ def evaluate(
     scenes = range(plan.first_scene, plan.first_scene + plan.scenes)
     jobs = [(s, found.get(s, {})) for s in scenes if names - set(found.get(s, {}))]
     results = folder / "episodes.jsonl"
+    if not results.exists() and (packed := packed_results(results)).exists():
+        results.write_bytes(gzip.decompress(packed.read_bytes()))  # goes on where the committed results ended
     if results.exists() and not (whole := results.read_bytes()).endswith(b"\n"):
         results.write_bytes(whole[: whole.rfind(b"\n") + 1])  # a killed run's torn line; its episode is run again
     if not jobs:

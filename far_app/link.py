@@ -17,7 +17,7 @@ import zmq
 
 from far_app.endpoints import Endpoints, Reply
 from far_app.errors import RobotError
-from far_app.protocols import Heartbeat, Hold, Request, Reset
+from far_app.protocols import Heartbeat, Hold, Request, Reset, Resume
 from far_app.scheduling import prompt_context
 from far_app.types import Ack, Observation, Target
 from far_app.wire import WireError, pack, unpack
@@ -28,6 +28,8 @@ SILENCE = 1.0
 """Seconds without an observation after which the robot counts as lost."""
 REQUEST_TIMEOUT = 1.0
 RESET_TIMEOUT = 10.0
+RESUME_TIMEOUT = 40.0
+"""A real arm is connected anew, cleared and enabled by it."""
 LAST_CHANCE = 0.1
 """Seconds given to this process's own reading thread, which may have been starved too, before the robot is lost."""
 POLL = 0.1
@@ -145,7 +147,7 @@ class RemoteRobot:
         if isinstance(request, Heartbeat):
             self._tell(request)
             return
-        limit = RESET_TIMEOUT if isinstance(request, Reset) else REQUEST_TIMEOUT
+        limit = {Reset: RESET_TIMEOUT, Resume: RESUME_TIMEOUT}.get(type(request), REQUEST_TIMEOUT)
         reply = self._ask(request, limit)
         if reply.error:
             raise RobotError(reply.error)
@@ -169,10 +171,15 @@ class RemoteRobot:
                 raise RobotError("this link to the hw server was closed; make another")
             self._request_number += 1
             number = str(self._request_number).encode()
-            deadline = time.monotonic() + limit
+            began = time.monotonic()
             try:
                 self._requests.send_multipart([number, pack(request)], zmq.NOBLOCK)
-                while self._requests.poll(max(0, int(1000 * (deadline - time.monotonic())))):
+                while (waited := time.monotonic() - began) < limit:
+                    if isinstance(request, Resume) and min(waited, self.silence()) > REQUEST_TIMEOUT:
+                        limit = REQUEST_TIMEOUT  # an arm that is made ready takes its time, but its server is heard
+                        break
+                    if not self._requests.poll(int(1000 * min(POLL, limit - waited))):
+                        continue
                     answered, raw = self._requests.recv_multipart()
                     if answered == number:  # else the late answer to a request that was given up
                         reply = unpack(raw)

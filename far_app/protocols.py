@@ -34,7 +34,8 @@ class Hold:
 
 @dataclass(frozen=True, kw_only=True)
 class Resume:
-    """Operator only: leave the latch. The next motion starts from the measured pose."""
+    """Operator only: leave the latch; the one thing that clears an error of a real arm. The next motion starts from the
+    measured pose."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +60,8 @@ class Robot(Protocol):
         ...
 
     def request(self, request: Request) -> None:
-        """Ask for a change of mode; returns once accepted (≤ 1 s; Reset ≤ 10 s), raises RobotError if refused.
+        """Ask for a change of mode; returns once accepted (≤ 1 s; Reset ≤ 10 s; Resume of a real arm, which is cleared,
+        enabled and if need be connected anew by it, ≤ 40 s), raises RobotError if refused.
         Progress shows in Observation.status."""
         ...
 
@@ -208,6 +210,12 @@ class KeepsWeights(Protocol):
 @runtime_checkable
 class SuccessDetector(Protocol):
     """Says when an attempt is over."""
+
+    @property
+    def patience(self) -> float:
+        """Seconds to wait for the operator's word, the arm held, when the horizon is over and nobody has said anything;
+        without one it is a failure. 0: it is a failure at once."""
+        ...
 
     def begin(self) -> None:
         """A new attempt."""

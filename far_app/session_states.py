@@ -119,6 +119,9 @@ def _table() -> dict[tuple[State, Event], State]:
         (s.READY, h.GO_ON_ATTEMPT): s.RUNNING,
         (s.READY, h.GO_ON_HOMING): s.HOMING,
         (s.READY, h.GO_ON_ADAPTING): s.ADAPTING,
+        # a way home may ask the operator to take what the hand holds
+        (s.HOMING, i.RESUME): s.HOMING,
+        (s.ADAPTING, i.RESUME): s.ADAPTING,
         # an attempt that a stop or a fault ended is accounted for after the operator cleared it
         (s.READY, h.SUCCEEDED): s.TRIAL_DONE,
         (s.READY, h.FAILED_RETRY): s.ADAPTING,

@@ -59,3 +59,8 @@ def at_pace(entry: TaskConfig, arm: Arm) -> TaskConfig:
         return replace(entry, rate=PANDA_HZ / entry.repeat)
     seconds = entry.horizon * entry.repeat / PANDA_HZ
     return replace(entry, rate=XARM_HZ, horizon=round(seconds * XARM_HZ), repeat=1)
+
+
+def supervised(entry: TaskConfig) -> TaskConfig:
+    """A task on a real arm: at most three attempts, success judged by a person (paper, Real-world Experiments)."""
+    return replace(entry, max_attempts=min(entry.max_attempts, 3), judge="person")

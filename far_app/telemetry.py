@@ -48,6 +48,8 @@ class TrialRow:
     """Chunks flagged over the trial."""
     seconds: float
     note: str = ""
+    counted: bool = True
+    """False for a trial that began at reduced speed: not for statistics."""
 
 
 @register
@@ -126,6 +128,14 @@ class OperatorIntent:
     intent: Intent
     operator: str = ""
     stamp: float = 0.0
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class PagePresence:
+    """From the page to the app, several times a second: somebody has it open, or nobody has."""
+
+    clients: int
 
 
 @register

@@ -21,11 +21,13 @@ from typing import Protocol
 import numpy as np
 
 from far_app.aggregation import Plan
+from far_app.alarm import Alarm, NoAlarm
 from far_app.config import TaskConfig
 from far_app.motion import ActionScale, TargetIntegrator
-from far_app.protocols import Heartbeat, Home, Method, Planner, PlanRequest, Reset, Robot, SuccessDetector
+from far_app.protocols import Heartbeat, Hold, Home, Method, Planner, PlanRequest, Reset, Robot, SuccessDetector
 from far_app.types import (
     ACTION_DIM,
+    ARM_DIMS,
     ActionChunk,
     Adaptation,
     Attempt,
@@ -37,6 +39,8 @@ from far_app.types import (
     Trial,
 )
 
+NO_ALARM = NoAlarm()
+
 
 @dataclass(frozen=True, kw_only=True)
 class Tick:
@@ -44,10 +48,12 @@ class Tick:
     monotonic clock in real time, simulated time in lockstep. By then the tick's target is to be with the arm."""
 
     phase: str
-    """"attempt" or "homing"."""
+    """"attempt", "judging" (the arm is held, the operator is asked) or "homing"."""
     attempt_index: int
     step: Step | None = None
     """The step that the last tick completed, with its acknowledged action and lateness."""
+    between: bool = False
+    """At reduced speed: a tick on the way from one of the policy's to the next."""
 
 
 class AfterHold(float):
@@ -102,6 +108,8 @@ def trial(
     task: TaskConfig,
     scale: ActionScale,
     start_adaptation: StartAdaptation,
+    stretch: int = 1,
+    alarm: Alarm = NO_ALARM,
 ) -> TrialEvents:
     """Algorithm 1. Returns the trial's attempts and adaptations; afterwards the method holds the base policy again."""
     attempts: list[Attempt] = []
@@ -111,7 +119,10 @@ def trial(
     yield from go_home(robot, attempt_index=1)
     for i in range(1, task.max_attempts + 1):
         yield AttemptStarted(attempt_index=i, policy_version=method.policy.version)
-        attempt = yield from execute(robot, planner, method, detector, task, scale, scene_seed, i)
+        slowly = stretch if i == 1 else 1
+        attempt = yield from execute(
+            robot, planner, method, detector, task, scale, scene_seed, i, slowly, alarm
+        )  # fmt: skip
         attempts.append(attempt)
         last = attempt.outcome.success or i == task.max_attempts
         yield AttemptEnded(attempt=attempt, last=last)
@@ -134,8 +145,12 @@ def execute(
     scale: ActionScale,
     scene_seed: int,
     index: int,
+    stretch: int = 1,
+    alarm: Alarm = NO_ALARM,
 ) -> Generator[Event, float | ActionChunk | None, Attempt]:
-    """One attempt. A tick: observe → judge → chunk → aggregate → perturb → target."""
+    """One attempt. A tick: observe → judge → chunk → aggregate → perturb → target.
+
+    Stretched, each of the policy's ticks takes so many of the robot's: the same way and the same horizon, slower."""
     spec = method.policy.spec
     plan = Plan(horizon=spec.horizon)
     perturbation = method.perturb(index, scene_seed)
@@ -143,6 +158,7 @@ def execute(
     steps: list[Step] = []
     step: Step | None = None
     detector.begin()
+    alarm.begin()
     planner.begin(method.policy)
     integrator = TargetIntegrator(scale, robot.observe().eef)
 
@@ -151,11 +167,11 @@ def execute(
         assert isinstance(deadline, float), "a Tick is answered with its deadline"
         observation = robot.observe()
         if step is not None:
-            steps.append(completed(step, observation, integrator))
+            steps.append(completed(step, observation, integrator, stretch))
         if isinstance(deadline, AfterHold):
             plan, integrator = Plan(horizon=spec.horizon), TargetIntegrator(scale, observation.eef)
             history.clear()
-        outcome = detector.judge(observation) or fault(observation)
+        outcome = detector.judge(observation) or fault(observation) or alarm.judge(plan, t)
         if outcome is not None or t == task.horizon:
             break
 
@@ -167,7 +183,17 @@ def execute(
         action = plan.action(t)  # â_t = g(chunks)
         delta = perturbation(t) if action is not None else np.zeros(ACTION_DIM)  # δ_t
         commanded = np.clip(action + delta, -1.0, 1.0) if action is not None else hold_still(steps)
-        target = integrator.target(commanded, observation.eef, deadline)
+        part = commanded / np.array((stretch,) * ARM_DIMS + (1,))
+        for _ in range(stretch - 1):
+            robot.send(integrator.target(part, robot.observe().eef, deadline))
+            deadline = yield Tick(phase="attempt", attempt_index=index, between=True)
+            assert isinstance(deadline, float), "a Tick is answered with its deadline"
+            for ack in robot.observe().acks:
+                integrator.executed(ack)
+            if isinstance(deadline, AfterHold):
+                plan, integrator = Plan(horizon=spec.horizon), TargetIntegrator(scale, robot.observe().eef)
+                history.clear()
+        target = integrator.target(part, robot.observe().eef, deadline)
         robot.send(target)
         step = Step(
             tick=t, seq=target.seq, stamp=observation.stamp, deadline=deadline, observation=observation,
@@ -177,10 +203,30 @@ def execute(
             success=observation.success,
         )  # fmt: skip
 
+    if outcome is None and detector.patience > 0:
+        outcome = yield from wait_for_word(robot, detector, index)
     return Attempt(
         index=index, scene_seed=scene_seed, steps=tuple(steps), final=observation,
         outcome=outcome or Outcome(success=False, judged_by=Judge.HORIZON), policy_version=method.policy.version,
     )  # fmt: skip
+
+
+def wait_for_word(
+    robot: Robot, detector: SuccessDetector, index: int
+) -> Generator[Event, float | ActionChunk | None, Outcome | None]:
+    """The horizon is over and nobody has judged: hold the arm and ask the operator, for so long as the detector says.
+    None when no word came."""
+    robot.request(Hold(reason="waiting for the operator: success or failure?"))
+    began = now = yield Tick(phase="judging", attempt_index=index)
+    assert isinstance(began, float) and isinstance(now, float), "a Tick is answered with its deadline"
+    while now < began + detector.patience:
+        observation = robot.observe()
+        outcome = detector.judge(observation) or fault(observation)
+        if outcome is not None:
+            return outcome
+        now = yield Tick(phase="judging", attempt_index=index)
+        assert isinstance(now, float), "a Tick is answered with its deadline"
+    return None
 
 
 def go_home(
@@ -196,12 +242,13 @@ def go_home(
             return
 
 
-def completed(step: Step, observation: Observation, integrator: TargetIntegrator) -> Step:
-    """The step with what was sent and how late, once its target is acknowledged."""
+def completed(step: Step, observation: Observation, integrator: TargetIntegrator, stretch: int) -> Step:
+    """The step with what was sent and how late, once its target (the last of its `stretch` parts) is acknowledged."""
     for ack in observation.acks:
         executed = integrator.executed(ack)
         if ack.seq == step.seq:
             sent = executed if executed is not None else step.sent
+            sent = sent * np.array((stretch,) * ARM_DIMS + (1,))
             return replace(step, sent=sent, lateness=ack.accepted - ack.due)
     return step
 

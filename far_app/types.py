@@ -213,7 +213,8 @@ class Adaptation:
     """What one failure taught: flagged chunks, pairs, losses, and the policy version that came of it."""
 
     status: str
-    """"adapted", "empty" (no pairs), "stopped" (guard), "cancelled", "failed", "timeout" or "none"."""
+    """"adapted", "empty" (no pairs), "stopped" (guard), "withdrawn" (hedge), "cancelled", "failed", "timeout" or
+    "none"."""
     base_version: str
     version: str
     """Policy version after the adaptation; equals base_version when nothing changed."""

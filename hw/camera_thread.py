@@ -1,5 +1,8 @@
 """The camera thread: owns the GL context, draws each newest snapshot for the policy, and for the operator in between.
 
+A rig with cameras of its own (hw/hardware_view.py) goes the same way: in place of a drawing there is its newest frame,
+with the frame's own timestamp, and a camera that is lost is a fault, told again while it lasts; the thread goes on.
+
 Policy pictures come first and are handed on at once. Operator pictures are drawn one camera at a time after them, and
 only while someone is subscribed, so that a watching page adds at most one picture to a tick.
 """
@@ -18,10 +21,12 @@ import zmq
 
 from far_app.config import TaskConfig
 from far_app.errors import FarError, GraphicsError
+from far_app.protocols import Camera
 from far_app.scheduling import DRAWING_NICENESS, PROMPT_NICENESS, nice
 from far_app.telemetry import SceneGeometry, View
 from far_app.wire import pack
 from hw.cameras import Moment, TwinCamera
+from hw.hardware_view import HardwareView
 from hw.plant import PlantView
 from hw.rig import RigConfig
 from hw.servo_thread import ServoThread
@@ -29,6 +34,8 @@ from hw.servo_thread import ServoThread
 log = logging.getLogger(__name__)
 
 JPEG_QUALITY = 80
+TELL_AGAIN = 1.0
+"""Seconds after which a camera that is still lost is told again: the operator may have resumed meanwhile."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +44,7 @@ class Pictures:
 
     images: Mapping[str, np.ndarray]
     stamp: float
+    """Of the oldest among them."""
     seq: int
 
 
@@ -58,6 +66,7 @@ class CameraThread:
         self._jpegs: dict[str, bytes] = {}
         self._views = 0
         self._watched = False
+        self._told = -TELL_AGAIN
         self.geometry: SceneGeometry | None = None
         self.drawn = 0
         self._seconds = 0.0
@@ -111,12 +120,12 @@ class CameraThread:
             socket.close()
             view.close()
 
-    def _cameras(self, view: PlantView, size: int) -> list[TwinCamera]:
+    def _cameras(self, view: PlantView, size: int) -> list[Camera]:
+        if isinstance(view, HardwareView):
+            return [view.camera(name, size) for name in self._task.cameras]
         return [TwinCamera(name, size, view, lambda: self._moment) for name in self._task.cameras]
 
-    def _loop(
-        self, view: PlantView, policy: list[TwinCamera], operator: list[TwinCamera], socket: zmq.Socket[bytes]
-    ) -> None:
+    def _loop(self, view: PlantView, policy: list[Camera], operator: list[Camera], socket: zmq.Socket[bytes]) -> None:
         due = time.monotonic()
         turn = 0
         share = 1.0 / (self._rig.operator_rate * max(1, len(operator)))
@@ -126,10 +135,12 @@ class CameraThread:
                 continue
             self._moment = moment
             self._draw(policy)
-            if self._anyone_watching(socket) and operator and time.monotonic() >= due:
+            self._look_after(view)
+            if self._anyone_watching(socket) and time.monotonic() >= due:
                 due = max(due + share, time.monotonic() - share)
-                self._draw_for_operator(operator[turn])
-                turn = (turn + 1) % len(operator)
+                if operator:  # an arm without cameras still shows its status
+                    self._draw_for_operator(operator[turn])
+                    turn = (turn + 1) % len(operator)
                 if turn == 0:
                     socket.send(pack(self._view(view, moment)), zmq.NOBLOCK)
 
@@ -138,14 +149,23 @@ class CameraThread:
             self._watched = socket.recv()[:1] == b"\x01"
         return self._watched
 
-    def _draw(self, cameras: list[TwinCamera]) -> None:
+    def _draw(self, cameras: list[Camera]) -> None:
         began = time.monotonic()
-        images = {camera.name: camera.frame().image for camera in cameras}
+        frames = {camera.name: camera.frame() for camera in cameras}
         self._seconds += time.monotonic() - began
         self.drawn += 1
-        self._on_pictures(Pictures(images=images, stamp=self._moment.stamp, seq=self._moment.seq))
+        stamp = min((frame.stamp for frame in frames.values()), default=self._moment.stamp)
+        images = {name: frame.image for name, frame in frames.items()}
+        self._on_pictures(Pictures(images=images, stamp=stamp, seq=self._moment.seq))
 
-    def _draw_for_operator(self, camera: TwinCamera) -> None:
+    def _look_after(self, view: PlantView) -> None:
+        """A lost camera is a fault; the pictures of the others go on."""
+        now = time.monotonic()
+        if isinstance(view, HardwareView) and now > self._told + TELL_AGAIN and (trouble := view.trouble(now)):
+            self._told = now
+            self._on_failure(trouble)
+
+    def _draw_for_operator(self, camera: Camera) -> None:
         bgr = np.ascontiguousarray(camera.frame().image[:, :, ::-1])
         _, jpeg = cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
         self._jpegs[camera.name] = jpeg.tobytes()

@@ -16,7 +16,7 @@ from far_app.errors import RobotError
 from far_app.protocols import Heartbeat, Hold, Home, Reset, Resume
 from far_app.scheduling import MESSAGE_PRIORITY, real_time
 from far_app.telemetry import GeometryRequest, SceneGeometry
-from far_app.types import Target
+from far_app.types import RobotMode, Target
 from far_app.wire import WireError, pack, unpack
 from hw.picture_timing import PictureTiming
 from hw.publisher_thread import PublisherThread
@@ -105,6 +105,11 @@ class CommandThread:
         if isinstance(request, Reset):
             self._pending.append((self._servo.reset(request.seed), address))
             return
+        if isinstance(request, Resume) and self._latched():
+            self._pending.append((self._servo.resume(), address))
+            return
+        if isinstance(request, Hold) and request.latch:
+            self._servo.halt()
         try:
             with self._servo.locked() as controller:
                 controller.request(request, time.monotonic())
@@ -112,6 +117,10 @@ class CommandThread:
             self._reply(address, str(error))
         else:
             self._reply(address)
+
+    def _latched(self) -> bool:
+        with self._servo.locked() as controller:
+            return controller.status().mode is RobotMode.LATCHED
 
     def _finish_resets(self) -> None:
         for future, address in [p for p in self._pending if p[0].done()]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,6 +34,10 @@ BREACH = 0.05
 """Metres outside the workspace box at which the measured arm counts as breaching it."""
 AT_WALL = 0.002
 """Metres outside the box within which a measured pose is taken for the box's wall itself."""
+STALE = 0.1
+"""Age of the arm's own report, seconds, from which it is not led on."""
+LOST = 1.0
+"""The same, from which it is a fault."""
 EPSILON = 1e-9
 
 
@@ -57,7 +62,7 @@ class ArmController:
         self.refuse_latched("Reset")
         self.measured = measured
         self.scene_seed = scene_seed
-        self._grip = -1.0
+        self._grip = -1.0 if measured.gripper > 0.9 else 1.0 - 2.0 * measured.gripper  # as it is: it may hold something
         self._homing: Homing | None = None
         self._at_home = self._breached = self._silent = False
         self._last_fresh = -math.inf
@@ -71,6 +76,8 @@ class ArmController:
             return self._refuse(target, now, f"the arm is latched ({self.reason or self._stop_reason}); resume first")
         if self.mode is RobotMode.HOMING:
             return self._refuse(target, now, "the arm is going home; targets are taken again when it is there")
+        if self.measured.age > STALE:
+            return self._refuse(target, now, f"the arm's last report is {1e3 * self.measured.age:.0f} ms old")
         state = self._state
         if self.mode is RobotMode.HOLD:
             state = self._at_rest()
@@ -108,6 +115,11 @@ class ArmController:
         if self.mode is RobotMode.LATCHED or self._stop_reason:
             raise RobotError(f"{what} refused: the arm is latched ({self.reason or self._stop_reason}); resume first")
 
+    def refuse_unlatching(self) -> None:
+        """Raise RobotError while a STOP is under way."""
+        if self._stop_reason:
+            raise RobotError("Resume refused: a STOP is being carried out; look, then resume again")
+
     def stop(self, reason: str) -> None:
         """Latch. Any thread, any time: a plain assignment that the next servo tick acts on before all else."""
         self._stop_reason = reason or "STOP"
@@ -140,15 +152,21 @@ class ArmController:
             self._latch(reason, fault=False)
         self._watch_arm(measured)
         silent = now - self._last_fresh >= self.rig.watchdog - EPSILON
+        stale = measured.age > STALE
         command: Follow | Along | Brake = Brake()
         if self.mode is RobotMode.TRACKING:
-            if silent:
+            if silent or stale:
                 self.holds += 1
-                self._hold(f"no fresh target for {self.rig.watchdog * 1e3:.0f} ms")
+                self._hold(
+                    f"no fresh target for {self.rig.watchdog * 1e3:.0f} ms" if silent
+                    else f"the arm's last report is {measured.age * 1e3:.0f} ms old (limit {STALE * 1e3:.0f} ms)"
+                )  # fmt: skip
             else:
                 command = Follow()
         elif self.mode is RobotMode.HOMING:
-            command = self._homing_command(measured, silent)
+            command = self._homing_command(measured, silent or stale)
+        if measured.stalled:
+            self._start_anew()
         verdict = safety_filter(self._state, command, self.rig.safety, now)
         self._state = verdict.state
         return verdict.pose, self._grip
@@ -160,7 +178,9 @@ class ArmController:
             if not self._silent:
                 self.holds += 1
                 homing.interrupt()
-                self.reason = f"homing stands still: no heartbeat for {self.rig.watchdog * 1e3:.0f} ms"
+                old = measured.age > STALE
+                what = "fresh report of the arm" if old else "heartbeat"
+                self.reason = f"homing stands still: no {what} for {(STALE if old else self.rig.watchdog) * 1e3:.0f} ms"
             self._silent = True
             return Brake()
         if self._silent:
@@ -182,6 +202,11 @@ class ArmController:
         numbers = (*measured.eef.position, *measured.eef.quaternion, *measured.joints)
         if measured.error and not (self.mode is RobotMode.LATCHED and self.fault):
             self._latch(measured.error, fault=True)
+        elif measured.age > LOST and self.mode is not RobotMode.LATCHED:
+            self._latch(
+                f"the arm has not reported its pose for {measured.age:.1f} s (limit {LOST:g} s): the link or the "
+                "controller is gone; look at both, then press Resume", fault=True,
+            )  # fmt: skip
         elif not all(map(math.isfinite, numbers)):
             self._latch("the arm reports a pose that is not a finite number; check the controller", fault=True)
             return
@@ -208,6 +233,15 @@ class ArmController:
     def _anchor(self) -> None:
         self._state = self._at_rest()
 
+    def _start_anew(self) -> None:
+        """The arm stands at the last command after a late tick: no speed is carried over, nothing is caught up."""
+        self._state = replace(
+            self._state, velocity=np.zeros(3), spin=np.zeros(3), reference=self._state.pose,
+            ramp_left=max(self._state.ramp_left, self.ramp),
+        )  # fmt: skip
+        if self._homing is not None:
+            self._homing.interrupt()
+
     def _hold(self, reason: str) -> None:
         self.mode, self.reason = RobotMode.HOLD, reason
         log.info("arm held: %s", reason)
@@ -226,9 +260,9 @@ class ArmController:
             return
         if self.measured.error:
             raise RobotError(f"Resume refused: the arm still reports '{self.measured.error}'; clear it at the arm")
-        if self._stop_reason:
-            raise RobotError("Resume refused: a STOP is being carried out; look, then resume again")
+        self.refuse_unlatching()
         if self.mode is RobotMode.LATCHED:
+            self._anchor()
             self._hold("resumed by the operator")
             self.fault, self._at_home = False, False
 

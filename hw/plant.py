@@ -31,10 +31,14 @@ class Measured:
     """The twin's own check, now."""
     reward: float = 0.0
     """The twin's shaped reward, in [0, 1]."""
+    age: float = 0.0
+    """Seconds since the arm told this; the twin's is always of this moment."""
+    stalled: bool = False
+    """No command reached the arm for a while: it stands at the last one, and motion must start anew from there."""
 
 
 class Plant(Protocol):
-    """Called from one thread, the servo thread."""
+    """Called from one thread, the servo thread; `halt` from any."""
 
     servo_hz: int
     """Servo ticks a second; a multiple of the policy's rate for the twin (120)."""
@@ -50,7 +54,22 @@ class Plant(Protocol):
         ...
 
     def reset(self, seed: int) -> None:
-        """Twin: objects as the seed says, arm at the start pose, at rest. Hardware: refuses with RobotError."""
+        """Twin: objects as the seed says, arm at the start pose, at rest. Hardware: the scene is the operator's and the
+        way to the start pose is Home's, so nothing happens."""
+        ...
+
+    def halt(self) -> None:
+        """STOP, from any thread, also while another call hangs: stop the arm by its fastest path. Returns at once,
+        never raises. Until `rearm` nothing more is sent. The twin's latch is enough: no-op."""
+        ...
+
+    def rearm(self) -> None:
+        """The operator pressed Resume: clear the arm's errors and be ready for commands from where it stands, without
+        moving. May block for seconds; raises RobotError saying what is still wrong. Twin: no-op."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the arm."""
         ...
 
     def snapshot(self) -> Any:

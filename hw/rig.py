@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from typing import Any
 from far_app.config import Arm, TaskConfig, from_table
 from far_app.errors import ConfigError
 from far_app.motion import ActionScale
+from hw.camera_config import CameraConfig, cameras_from
+from hw.xarm7.settings import XArmSettings
 
 RIGS = Path(__file__).parent / "rigs"
 
@@ -95,6 +98,23 @@ class RigConfig:
     """Pixels, square."""
     operator_rate: float = 12.0
     """Operator pictures a second."""
+    cameras: Mapping[str, CameraConfig] | None = None
+    """The file's [camera.NAME] tables; empty where it says cameras = [], none on purpose. None: the task's own views,
+    which the twin draws."""
+    xarm: XArmSettings = field(default_factory=XArmSettings)
+    """A real xArm7's controller, tool and gripper."""
+
+    def __post_init__(self) -> None:
+        if self.robot not in ("twin", "xarm"):
+            raise ConfigError(f"rig {self.name} drives a robot of kind '{self.robot}'; choose one of: twin, xarm")
+        if self.robot == "xarm" and self.cameras is None:
+            raise ConfigError(f"rig {self.name} names no cameras; say cameras = [] where it has none")
+        reach = self.xarm.servo_step * 100.0
+        if self.robot == "xarm" and self.safety.speed > reach + 1e-9:
+            raise ConfigError(
+                f"rig {self.name}: safety.speed is {self.safety.speed} m/s, but a servo step of at most "
+                f"{self.xarm.servo_step * 1e3:g} mm at 100 Hz allows {reach:g} m/s; lower the one or raise the other"
+            )
 
     def scale_for(self, task: TaskConfig) -> ActionScale:
         """What ±1 means in a tick of the task."""
@@ -114,8 +134,24 @@ def load_rig(name_or_path: str, task: str = "") -> RigConfig:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"rig file {path} is not valid TOML: {error}") from error
     station = table.pop("station", {}).get(task, {})
-    rig = from_table(RigConfig, laid_over(table, station), path.name)
-    return replace(rig, safety=replace(rig.safety, upright=rig.start_quaternion))
+    table = laid_over(table, station)
+    cameras = cameras_from(table, path.name)
+    if cameras is not None:
+        table["cameras"] = []  # named; filled in below, where they are no longer a table
+    rig = from_table(RigConfig, table, path.name)
+    return replace(rig, cameras=cameras, safety=replace(rig.safety, upright=rig.start_quaternion))
+
+
+def at_address(rig: RigConfig, address: str) -> RigConfig:
+    """The rig with its controller at ADDRESS or ADDRESS:PORT; as it is when that is empty."""
+    if not address:
+        return rig
+    if rig.robot != "xarm":
+        raise ConfigError(f"rig {rig.name} is a {rig.robot}, it has no controller to be reached at {address}")
+    host, _, port = address.partition(":")
+    if port and not port.isdigit():
+        raise ConfigError(f"'{address}' is not ADDRESS or ADDRESS:PORT")
+    return replace(rig, xarm=replace(rig.xarm, address=host, port=int(port) if port else rig.xarm.port))
 
 
 def laid_over(table: dict[str, Any], station: dict[str, Any]) -> dict[str, Any]:

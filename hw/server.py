@@ -35,13 +35,15 @@ from far_app.errors import ConfigError, FarError, RobotError
 from far_app.protocols import Hold
 from far_app.scheduling import PROMPT_NICENESS, SWITCH_INTERVAL, nice, prompt_context
 from far_app.tasks import task as task_named
+from hw.camera_config import with_views
 from hw.camera_thread import CameraThread
 from hw.command_thread import CommandThread
 from hw.controller import ArmController
+from hw.hardware_view import HardwareView
 from hw.picture_timing import PictureTiming
 from hw.plant import Plant, PlantView
 from hw.publisher_thread import PublisherThread
-from hw.rig import RigConfig, load_rig
+from hw.rig import RigConfig, at_address, load_rig
 from hw.servo_thread import ServoThread
 from hw.stop_thread import StopThread
 
@@ -57,8 +59,11 @@ BRAKING = 0.3
 
 def make_plant(rig: RigConfig, task: TaskConfig) -> tuple[Plant, Callable[[], PlantView]]:
     """The plant of a rig, and how to make its view (in the camera thread)."""
-    if rig.robot != "twin":
-        raise ConfigError(f"rig {rig.name} drives a robot of kind '{rig.robot}'; this server knows: twin")
+    if rig.robot == "xarm":
+        from hw.xarm7.blind import BlindView
+        from hw.xarm7.plant import XArmPlant
+
+        return XArmPlant(rig, task), BlindView
     from hw.twin import TwinPlant
     from hw.twin_view import TwinView
 
@@ -72,7 +77,9 @@ class Server:
 
     def __init__(self, rig: RigConfig, task: TaskConfig, endpoints: Endpoints) -> None:
         self.context = prompt_context()
-        self.plant, make_view = make_plant(rig, task)
+        self.plant, make_bodies = make_plant(rig, task)
+        cameras = rig.cameras
+        make_view = (lambda: HardwareView(make_bodies(), cameras)) if cameras else make_bodies
         controller = ArmController(rig, task, self.plant.servo_hz, self.plant.measure())
         self.servo = ServoThread(self.plant, controller, camera_rate=task.rate)
         self.publisher = PublisherThread(self.servo, self.context, endpoints.observations, task.rate)
@@ -103,7 +110,7 @@ class Server:
             controller.request(Hold(reason=reason), time.monotonic())
         if self.servo.alive:
             time.sleep(BRAKING)
-        for part in (self.commands, self.cameras, self.publisher, self.stop, self.servo):
+        for part in (self.commands, self.cameras, self.publisher, self.stop, self.servo, self.plant):
             part.close()
         self.context.destroy(linger=0)
         log.info("%s", self.servo.report())
@@ -133,8 +140,9 @@ class Ending:
 
 
 def serve(
-    folder: Path, rig_name: str, task_name: str, parent: int | None, say: Callable[[dict[str, object]], None]
-) -> None:
+    folder: Path, rig_name: str, task_name: str, parent: int | None, say: Callable[[dict[str, object]], None],
+    address: str = "",
+) -> None:  # fmt: skip
     """Runs the server to its end."""
     began = time.monotonic()
     longest = len(str(folder / "observations").encode())
@@ -144,8 +152,8 @@ def serve(
         )
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        rig = load_rig(rig_name, task_name)
-        task = task_named(task_name, rig.arm)
+        rig = at_address(load_rig(rig_name, task_name), address)
+        task = with_views(task_named(task_name, rig.arm), rig.cameras)
         server = Server(rig, task, Endpoints.in_folder(folder))
         server.start()
     except zmq.ZMQError as error:
@@ -165,6 +173,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--folder", type=Path, required=True, help="where the ipc endpoints lie")
     parser.add_argument("--rig", default="twin", help="a rig's name or the path of its TOML file")
     parser.add_argument("--task", default="lift")
+    parser.add_argument("--address", default="", help="ADDRESS[:PORT] of a real arm's controller, over the rig file's")
     parser.add_argument("--parent", type=int, default=None, help="end when this process is no longer our parent")
     options = parser.parse_args(arguments)
     handshake = os.fdopen(os.dup(1), "w")  # standard output stays ours; what libraries print goes to standard error
@@ -179,7 +188,7 @@ def main(arguments: list[str] | None = None) -> int:
         handshake.flush()
 
     try:
-        serve(options.folder, options.rig, options.task, options.parent, say)
+        serve(options.folder, options.rig, options.task, options.parent, say, options.address)
     except FarError as error:
         log.error("%s", error)
         say({"error": str(error), "kind": type(error).__name__})

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from far_app.errors import FarError
+from far_app.protocols import Resume
 from far_app.scheduling import SERVO_NICENESS, SERVO_PRIORITY, real_time
 from hw.cameras import Moment
 from hw.controller import ArmController
@@ -76,8 +77,13 @@ class ServoThread:
             yield self._controller
 
     def stop(self, reason: str) -> None:
-        """Latch at the next servo tick, whoever holds the lock."""
+        """Stop the arm by its fastest path now and latch at the next servo tick, whoever holds the lock."""
+        self._plant.halt()
         self._controller.stop(reason)
+
+    def halt(self) -> None:
+        """Stop the arm by its fastest path now."""
+        self._plant.halt()
 
     def call(self, work: Callable[[], None]) -> Future[None]:
         """Run this in the servo thread, between two ticks."""
@@ -93,6 +99,20 @@ class ServoThread:
             self._plant.reset(seed)
             with self._lock:
                 self._controller.reset(self._plant.measure(), seed)
+
+        return self.call(work)
+
+    def resume(self) -> Future[None]:
+        """Leave the latch: the arm is made ready first, in the servo thread (nothing moves while it is latched)."""
+
+        def work() -> None:
+            with self._lock:
+                self._controller.refuse_unlatching()
+            self._plant.rearm()
+            measured = self._plant.measure()
+            with self._lock:
+                self._controller.measured = measured
+                self._controller.request(Resume(), time.monotonic())
 
         return self.call(work)
 

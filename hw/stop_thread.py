@@ -48,7 +48,7 @@ class StopThread:
                 continue
             raw = socket.recv()
             latched = time.monotonic()
-            self._servo.stop("STOP")
+            self._servo.stop("STOP")  # first of all: on a real arm this puts the frame on the wire
             socket.send(pack(StopAck(latched=latched)), zmq.NOBLOCK)
             try:
                 request = unpack(raw)

@@ -197,6 +197,12 @@ class TwinPlant:
         if self._ticks % self._policy_tick == 0:
             self._task_check = (bool(self.env._check_success()), float(self.env.reward(None)))
 
+    def halt(self) -> None: ...
+
+    def rearm(self) -> None: ...
+
+    def close(self) -> None: ...
+
     def snapshot(self) -> Snapshot:
         return Snapshot(
             qpos=self.data.qpos.copy(), body_pos=self.model.body_pos.copy(), body_quat=self.model.body_quat.copy()

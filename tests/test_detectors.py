@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from far_app.detectors import OperatorOverride, TwinCheck
+from far_app.detectors import OperatorOverride, PersonJudge, TwinCheck
 from far_app.protocols import SuccessDetector
 from far_app.types import Judge, Observation, Outcome, Pose, RobotMode, RobotStatus
 
@@ -53,3 +53,11 @@ def test_the_operators_first_word_stands_until_the_next_attempt():
     assert detector.judge(seen(True)) is failure
     detector.begin()
     assert detector.judge(seen(False)) is None
+
+
+def test_a_person_is_waited_for_and_nobody_else_says_anything():
+    detector = OperatorOverride(PersonJudge(20.0))
+    assert isinstance(detector, SuccessDetector) and detector.patience == 20.0
+    detector.begin()
+    assert detector.judge(seen(True)) is None
+    assert OperatorOverride(TwinCheck()).patience == 0.0

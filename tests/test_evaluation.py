@@ -1,6 +1,7 @@
 """The evaluation keeps what it has, refuses to mix, and runs a shared first attempt once."""
 
 import dataclasses
+import gzip
 import json
 import os
 import signal
@@ -46,6 +47,19 @@ def test_a_second_start_does_only_what_is_missing(tmp_path):
     assert found == {(s, a) for s in (100, 101, 102) for a in ("nr", "far")}
 
 
+def test_committed_results_are_read_packed_and_go_on_from_there(tmp_path):
+    evaluate(tmp_path, dataclasses.replace(PLAN, scenes=2), 1, lambda record: None, begin, work)
+    results = tmp_path / "episodes.jsonl"
+    before = read_results(results)
+    (tmp_path / "episodes.jsonl.gz").write_bytes(gzip.compress(results.read_bytes()))
+    results.unlink()
+    assert read_results(results) == before
+    WORKED.clear()
+    evaluate(tmp_path, PLAN, 1, lambda record: None, begin, work)
+    assert WORKED == [102]
+    assert read_results(results)[: len(before)] == before
+
+
 def killed_in_scene_101(block):
     for record in work(block):
         if record["scene"] == 101:
@@ -69,6 +83,16 @@ def test_results_of_another_plan_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="another plan"):
         evaluate(tmp_path, dataclasses.replace(PLAN, max_attempts=5), 1, lambda record: None, begin, work)
     assert json.loads((tmp_path / "plan.json").read_text())["max_attempts"] == 2
+
+
+def test_a_plan_may_grow_by_an_arm_but_not_change_one(tmp_path):
+    evaluate(tmp_path, dataclasses.replace(PLAN, arms=PLAN.arms[:1]), 1, lambda record: None, begin, work)
+    WORKED.clear()
+    evaluate(tmp_path, PLAN, 1, lambda record: None, begin, work)
+    assert [a["name"] for a in json.loads((tmp_path / "plan.json").read_text())["arms"]] == ["nr", "far"]
+    changed = Arm(name="far", method="far", retry=RetryConfig(fcpa=FCPAConfig(lr=1e-3)))
+    with pytest.raises(ConfigError, match="another plan"):
+        evaluate(tmp_path, dataclasses.replace(PLAN, arms=(PLAN.arms[0], changed)), 1, print, begin, work)
 
 
 def test_a_first_attempt_success_is_run_once():

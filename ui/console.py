@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,8 @@ from ui.scene3d import BRAND, FLAGGED, Scene3D
 from ui.stop import StopLine
 from ui.view_model import Freshness, adaptation, arm_word, banner, control, loop_gauges, summary
 
-CAMERAS = ("front", "wrist")
+PLACES = ("front", "wrist")
+"""On the page, left to right, as style.css names them, whatever the views are called; more of them: the rerun page."""
 CONFIRM = 4.0
 """Seconds within which a second click ends the session."""
 _STYLE = (Path(__file__).parent / "style.css").read_text(encoding="utf-8")
@@ -73,7 +74,9 @@ class Console:
         latest: Callable[[], tuple[Telemetry | None, Freshness]],
         *,
         scene3d: bool,
+        cameras: Sequence[str] = PLACES,
     ) -> None:
+        self._cameras = cameras
         self.pressed: queue.SimpleQueue[Intent] = queue.SimpleQueue()
         """Intents that passed the guard, for the caller to send."""
         self.refusal = ""
@@ -124,8 +127,8 @@ class Console:
         return _place(handle, button.box)
 
     def _add_cameras(self) -> None:
-        for camera in CAMERAS:
-            self._gui.add_html(html.caption(camera, "", f"mark-{camera}"))
+        for camera, place in zip(self._cameras, PLACES, strict=False):
+            self._gui.add_html(html.caption(camera, "", f"mark-{place}"))
             self._images[camera] = self._gui.add_image(_BLANK, format="jpeg")
 
     def _press_stop(self, source: str) -> None:

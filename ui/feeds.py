@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from typing import Any
@@ -10,7 +11,7 @@ import zmq
 
 from far_app.endpoints import Endpoints
 from far_app.session_states import Intent
-from far_app.telemetry import GeometryRequest, OperatorIntent, SceneGeometry, Telemetry, View
+from far_app.telemetry import GeometryRequest, OperatorIntent, PagePresence, SceneGeometry, Telemetry, View
 from far_app.wire import WireError, pack, unpack
 
 log = logging.getLogger(__name__)
@@ -131,6 +132,11 @@ class Feeds:
         except zmq.Again:
             return False
         return True
+
+    def present(self, clients: int) -> None:
+        """Tell the app how many look at the page; lost where nobody takes it."""
+        with contextlib.suppress(zmq.Again):
+            self._intents.send(pack(PagePresence(clients=clients)), zmq.NOBLOCK)
 
     def close(self) -> None:
         self.telemetry.close()

@@ -82,6 +82,14 @@ class RawClient:
         """Click a button, disabled or not."""
         self.send({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": True}})
 
+    def look(self) -> None:
+        """Tell of a camera, as a browser does once it shows the page; until then nobody counts as looking at it."""
+        self.send({
+            "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (1.0, 1.0, 1.0), "fov": 1.0,
+            "near": 0.01, "far": 100.0, "image_height": 600, "image_width": 800, "look_at": (0.0, 0.0, 0.0),
+            "up_direction": (0.0, 0.0, 1.0),
+        })  # fmt: skip
+
     def send(self, message: dict[str, Any]) -> None:
         self._socket.send(msgspec.msgpack.encode(message))
 

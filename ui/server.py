@@ -59,6 +59,8 @@ class PageOptions:
     port: int = 8080
     scene3d: bool = True
     operator: str = "operator"
+    cameras: Sequence[str] = ("front", "wrist")
+    """Views whose pictures are shown; the first two fit."""
     rerun: bool = True
     """Show the session live in rerun too, in a process of its own."""
     recordings: Path = Path("recordings")
@@ -78,9 +80,12 @@ class Page:
             hasten(listener.native_id)  # the thread that hears STOP
         self._feeds = Feeds(endpoints)
         self._stop_line = StopLine(endpoints.stop)
-        self._console = Console(self._server, self._stop_line, self._latest, scene3d=options.scene3d)
+        self._console = Console(
+            self._server, self._stop_line, self._latest, scene3d=options.scene3d, cameras=options.cameras
+        )
         self._viewer = LiveViewer(options.run_folder, options.recordings) if options.rerun else None
         self._plots, self._texts, self._trails, self._beats = Every(1 / 5), Every(1 / 5), Every(1 / 5), Every(1 / 2)
+        self._presence = Every(1 / 4)
         self._hw_seq = 0
 
     def _latest(self) -> tuple[Telemetry | None, Freshness]:
@@ -94,6 +99,8 @@ class Page:
         now = time.monotonic()
         heard = self._feeds.telemetry.poll()
         telemetry, fresh = self._latest()
+        if self._presence(now):
+            self._feeds.present(len(self._server.get_clients()))
         with self._server.atomic():
             self._show_view()
             if self._beats(now):
@@ -166,6 +173,7 @@ def parse(arguments: Sequence[str] | None) -> PageOptions:
     parser.add_argument("--host", default="127.0.0.1", help="loopback address to bind")
     parser.add_argument("--port", type=int, default=8080, help="0 lets the system choose")
     parser.add_argument("--operator", default="operator", help="name stored with every intent")
+    parser.add_argument("--cameras", nargs="*", default=("front", "wrist"), help="views to show, the first two of them")
     parser.add_argument("--recordings", type=Path, default=Path("recordings"), help="folder of the sessions")
     parser.add_argument("--no-rerun", dest="rerun", action="store_false", help="no live rerun viewer")
     parser.add_argument("--no-scene3d", dest="scene3d", action="store_false", help="leave out the twin's meshes")

@@ -109,9 +109,9 @@ def banner(telemetry: Telemetry | None, fresh: Freshness) -> Banner:
 def _detail(telemetry: Telemetry) -> str:
     t = telemetry
     if t.countdown > 0:
-        return f"Next attempt in {t.countdown:.0f} s. Pause to cancel."
+        return t.reason or f"Next attempt in {t.countdown:.0f} s. Pause to cancel."
     home = f"going home {100 * t.homing_progress:.0f} %"
-    if t.state is State.ADAPTING:
+    if t.state is State.ADAPTING and not t.reason:
         flagged = (
             _count(len(t.flagged), "chunk") + " flagged" if t.flagged else _STATUS.get(t.adaptation_status, ("",))[0]
         )
@@ -189,6 +189,7 @@ _STATUS: dict[str, tuple[str, Tone]] = {
     "adapted": ("adapted", Tone.GOOD),
     "empty": ("no pairs: policy unchanged", Tone.WARN),
     "stopped": ("adapted, stopped by the guard", Tone.GOOD),
+    "withdrawn": ("lesson withdrawn: a plain try next", Tone.WARN),
     "cancelled": ("cancelled", Tone.WARN),
     "failed": ("failed: policy unchanged", Tone.BAD),
     "timeout": ("over its time limit: policy unchanged", Tone.WARN),
@@ -283,6 +284,7 @@ def summary(history: tuple[TrialRow, ...]) -> str:
     """The session so far in one line."""
     if not history:
         return "no trial finished yet"
+    history = tuple(row for row in history if row.counted)
     solved = [row for row in history if row.success]
     first = sum(row.attempts == 1 for row in solved)
     return f"{len(solved)} of {len(history)} solved · {first} at once · {len(solved) - first} after a retry"

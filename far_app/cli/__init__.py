@@ -14,6 +14,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("far_app.cli.demo", "make demonstrations with the scripted expert"),
     "train policy": ("far_app.cli.train_policy", "train the diffusion policy on demonstrations"),
     "train critic": ("far_app.cli.train_critic", "train the IQL critic on demonstrations"),
+    "train success": ("far_app.cli.train_success", "train and calibrate a detector of success on outcomes alone"),
+    "train alarm": ("far_app.cli.train_alarm", "calibrate an alarm that ends hopeless attempts early"),
     "eval": ("far_app.cli.evaluate", "compare ways to retry, in lockstep, over many scenes"),
     "study": ("far_app.cli.study", "tasks × training seeds × methods from one file: models, episodes, tables"),
     "improve": ("far_app.cli.improve", "collect with retries, learn from successes and failures, again and again"),
@@ -31,6 +33,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "bench infer": ("far_app.bench.infer", "milliseconds per chunk, by preset"),
     "bench adapt": ("far_app.bench.adapt", "seconds from a failed attempt to a new policy version, by stage"),
     "bench critic": ("far_app.bench.critic", "can Q rank what the policy would do: before trusting FAR with a model"),
+    "bench success": ("far_app.bench.success", "a success detector against the twin's own check, on held-out attempts"),
+    "bench alarm": ("far_app.bench.alarm", "what an early failure alarm would have saved and lost"),
+    "bench faults": ("far_app.bench.faults", "a real arm's faults on the fake controller: held, told, resumed"),
+    "fake-xarm": ("hw.fake_xarm.__main__", "a controller that speaks an xArm7's protocols: try a real arm's path"),
     "doctor": ("far_app.cli.doctor", "what this machine has, and what to do about what it lacks"),
 }
 

@@ -44,6 +44,8 @@ class DemoOptions:
     explore: float = 0.0
     """With --policy: standard deviation of smoothed perturbations of the translation, in action units. A critic learns
     from them what other actions would have led to."""
+    linger: int = 0
+    """Ticks to go on after a success: a success detector learns from them what success looks like."""
     rig: str = "twin"
     images: bool = True
     """Draw the cameras; a policy of the `state` preset needs none."""
@@ -53,6 +55,7 @@ def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(DemoOptions, args=list(arguments), prog="far demo")
     rig = load_rig(options.rig, options.task)
     task = find_task(options.task, rig.arm)
+    task = dataclasses.replace(task, success_ticks=task.success_ticks + options.linger)
     path = options.out or Path("datasets") / f"{task.name}.hdf5"
     env_args = origin(task, rig)
     check_origin(path, env_args)

@@ -1,4 +1,7 @@
-"""`far doctor`: one line for each thing the application stands on, with what to do where it is lacking."""
+"""`far doctor`: one line for each thing the application stands on, with what to do where it is lacking.
+
+With --rig it checks one rig file and its controller instead (far_app/cli/doctor_rig.py).
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,15 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="far doctor", description="What this machine has, and what to do about it.")
     parser.add_argument("--port", type=int, default=8080, help="the page's port")
     parser.add_argument("--recordings", type=Path, default=Path("recordings"))
+    parser.add_argument(
+        "--rig", help="check this rig file (name or path) instead, and its controller where one answers"
+    )
+    parser.add_argument("--host", default="", help="ADDRESS[:PORT] of the controller, over the rig file's")
     options = parser.parse_args(list(arguments))
+    if options.rig is not None:
+        from far_app.cli.doctor_rig import check_rig
+
+        return check_rig(options.rig, options.host)
     checks: tuple[tuple[str, Callable[[], Finding]], ...] = (
         ("Python", python),
         ("packages", packages),

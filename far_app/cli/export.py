@@ -7,10 +7,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
+from far_app.config import TaskConfig, from_table
 from far_app.errors import ConfigError
 from far_app.exchange.rrd import write_rrds
 from far_app.exchange.select import Only, Selection, chosen, rollouts
@@ -18,6 +19,8 @@ from far_app.recording.inspect import find_session
 from far_app.recording.reader import read_session
 from far_app.recording.schema import SessionInfo
 from far_app.tasks import task
+from hw.rig import RigConfig
+from hw.setup import setup_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +62,7 @@ def main(arguments: Sequence[str]) -> int:
 
         check_alike(sessions, infos)
         count = write_lerobot(
-            options.out, rollouts(sessions, selection, say), infos[0].rate, robot_name(infos[0]),
+            options.out, rollouts(sessions, selection, say), infos[0].rate, env_args(infos[0]),
             lambda name: options.instruction or name, options.overwrite,
         )  # fmt: skip
     elif options.to == "robomimic":
@@ -86,10 +89,21 @@ def check_alike(sessions: Sequence[Path], infos: Sequence[SessionInfo]) -> None:
             raise ConfigError(f"{path} is of {words(info)}, {sessions[0]} of {words(infos[0])}; export them apart")
 
 
-def env_args(info: SessionInfo) -> dict[str, object]:
+def env_args(info: SessionInfo) -> dict[str, Any]:
     """Where the episodes come from, as robomimic has it (and `far demo` writes it)."""
     environment = info.config.get("task", {}).get("environment") or task(info.task).environment
-    return {"env_name": environment, "type": 1, "env_kwargs": {"robots": robot_name(info), "rig": dict(info.rig)}}
+    kwargs = {"robots": robot_name(info), "rig": dict(info.rig)}
+    return {"env_name": environment, "type": 1, "env_kwargs": kwargs, "setup": setup(info)}
+
+
+def setup(info: SessionInfo) -> dict[str, Any] | None:
+    """What the preflight of a policy that learns from the session compares; None where an older recording does not say
+    enough."""
+    try:
+        rig = from_table(RigConfig, info.rig, "rig")
+        return setup_of(rig, from_table(TaskConfig, info.config["task"], "task")).table()
+    except (ConfigError, KeyError, TypeError, AttributeError):
+        return None
 
 
 def robot_name(info: SessionInfo) -> str:

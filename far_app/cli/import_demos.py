@@ -24,7 +24,8 @@ class ImportOptions:
     gripper: tuple[float, float] | None = None
     """The source's gripper reading when closed and when open, where the gripper is not a Panda's or ours."""
     image_size: int | None = None
-    """Scale pictures to so many pixels; policies here see 84."""
+    """Cut pictures to their largest centred square and scale it to so many pixels; whole frames by default, of which
+    training makes the pictures its policy sees."""
     overwrite: bool = False
     """Replace what is at --out."""
 

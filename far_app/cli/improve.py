@@ -179,13 +179,15 @@ def learn(
     from far_app.learning.dataset import read_episodes
     from far_app.learning.improve import Experience, finetuning
     from far_app.learning.improve import learn as learn_from
-    from far_app.learning.policy import load_policy
+    from far_app.learning.policy import load_policy, trained_framings
     from far_app.learning.train_critic import CriticTraining
 
     config, loop = load_policy(policy, task.name).config, options.loop
     data = options.data or Path("datasets") / f"{task.name}.hdf5"
     known = Experience(
-        demonstrations=read_episodes(data, config.cameras, options.demonstrations),
+        demonstrations=read_episodes(
+            data, config.cameras, options.demonstrations, config.image_size, trained_framings(policy)
+        ),
         succeeded=[e for e in collected if e.success], failed=[e for e in collected if not e.success],
     )  # fmt: skip
     seed = loop.seed * 1_000 + number

@@ -15,8 +15,10 @@ from far_app.protocols import Method, Resume
 from far_app.types import Trial
 from hw.lockstep import LockstepRobot
 from hw.rig import RigConfig, load_rig
+from hw.setup import setup_of
 
 if TYPE_CHECKING:
+    from far_app.alarm import Alarm
     from far_app.session.lockstep import Take
 
 J = TypeVar("J", bound=Hashable)
@@ -45,20 +47,24 @@ def lockstep_twins(rig_name: str, task: TaskConfig, count: int, images: bool = T
 
 
 def origin(task: TaskConfig, rig: RigConfig) -> dict[str, object]:
-    """Where a dataset's episodes come from, as robomimic's env_args."""
+    """Where a dataset's episodes come from, as robomimic's env_args; `setup` is ours (far_app/preflight.py)."""
     return {
         "env_name": task.environment, "type": 1,
-        "env_kwargs": {"robots": rig.arm, "rig": dataclasses.asdict(rig)},
+        "env_kwargs": {"robots": rig.arm, "rig": dataclasses.asdict(rig)}, "setup": setup_of(rig, task).table(),
     }  # fmt: skip
 
 
 def trials(
-    scenes: Iterable[int], robots: Sequence[LockstepRobot], methods: Sequence[Method], task: TaskConfig
+    scenes: Iterable[int],
+    robots: Sequence[LockstepRobot],
+    methods: Sequence[Method],
+    task: TaskConfig,
+    alarms: Sequence[Alarm] = (),
 ) -> Iterator[tuple[int, Trial]]:
     """A trial of each scene, as many side by side as there are robots, each as it ends; a method for each robot."""
     waiting = iter(scenes)
     return side_by_side(
-        lambda: next(waiting, None), robots, lambda scene, lane: (scene, methods[lane]), task
+        lambda: next(waiting, None), robots, lambda scene, lane: (scene, methods[lane]), task, alarms
     )  # fmt: skip
 
 
@@ -67,20 +73,23 @@ def side_by_side(
     robots: Sequence[LockstepRobot],
     cast: Callable[[J, int], tuple[int, Method]],
     task: TaskConfig,
+    alarms: Sequence[Alarm] = (),
 ) -> Iterator[tuple[J, Trial]]:
-    """Trials of whatever `take` hands out; `cast` names the scene of a job and its method on a lane."""
+    """Trials of whatever `take` hands out; `cast` names the scene of a job and its method on a lane; an alarm for each
+    robot, or none."""
     from far_app.detectors import TwinCheck
     from far_app.session.lockstep import Advance, Lane, adapt_at_once, run_together
     from far_app.session.planners import LockstepPlanner
-    from far_app.trial import TrialEvents, trial
+    from far_app.trial import NO_ALARM, TrialEvents, trial
 
     def start(job: J, lane: int) -> tuple[TrialEvents, Advance]:
         robot = robots[lane]
         robot.request(Resume())
         scene, method = cast(job, lane)
         events = trial(
-            scene, robot, LockstepPlanner(), method, TwinCheck(task.success_ticks), task, robot.scale, adapt_at_once
-        )
+            scene, robot, LockstepPlanner(), method, TwinCheck(task.success_ticks), task, robot.scale, adapt_at_once,
+            alarm=alarms[lane] if alarms else NO_ALARM,
+        )  # fmt: skip
         return events, robot.advance
 
     def failed(job: J, lane: Lane, error: RobotError) -> Trial:

@@ -9,6 +9,7 @@ from typing import Literal
 from far_app.cli.settings import Settings
 from far_app.config import RetryConfig
 from far_app.errors import ConfigError
+from hw.rig import RigConfig, at_address, load_rig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,8 +27,14 @@ class RunOptions:
     method: str = "far"
     """How to retry: dp, nr, perturb, fcpa, far, bgr, rerank, negative-guidance."""
     task: str = "lift"
-    rig: str = "twin"
-    """Name below hw/rigs, or the path of a rig's TOML file."""
+    robot: Literal["twin", "xarm"] | None = None
+    """twin simulates, xarm is a real xArm7; the rig file's own when it is not given."""
+    rig: str | None = None
+    """Name below hw/rigs, or the path of a rig's TOML file; the robot's own by default (twin, xarm7)."""
+    host: str = ""
+    """ADDRESS[:PORT] of a real arm's controller, over the rig file's."""
+    full_speed: bool = False
+    """Real arm: the session's first attempt too runs at the policy's own speed."""
     policy: str | None = None
     """Policy checkpoint; the shipped quickstart model by default."""
     critic: Path | None = None
@@ -40,7 +47,7 @@ class RunOptions:
     """Attempts a trial; the task's by default."""
     port: int = 8080
     """The page's port; 0 takes a free one."""
-    host: str = "127.0.0.1"
+    page_host: str = "127.0.0.1"
     """Address the page binds to."""
     rerun: bool = True
     """Show the session live in a rerun viewer too."""
@@ -54,8 +61,35 @@ class RunOptions:
     """Begin from what the checkpoint's makers recommend (the retry.toml beside it), or from the paper's settings."""
     retry: RetryConfig = field(default_factory=RetryConfig)
     """Settings of the method."""
+    detector: Path | None = None
+    """Success detector (`far train success`) in place of the twin's own check or a person."""
+    alarm: Path | None = None
+    """Early failure alarm (`far train alarm`): ends attempts that get nowhere before their horizon."""
+    judge_wait: float = 30.0
+    """Seconds to wait for your word on an attempt that nobody could judge; then it is a failure. Headless: none."""
+    shadow: bool = False
+    """The policy runs and its path is shown, with the arm held: nothing that moves it leaves the app."""
+    accept_differences: bool = False
+    """Go on though the rig differs from what the policy's data were made on; the preflight says in what."""
     verbose: bool = False
     """Log every phase change to the terminal."""
+
+    @property
+    def rig_file(self) -> str:
+        """Name or path of the rig."""
+        return self.rig or {"xarm": "xarm7"}.get(self.robot or "", "twin")
+
+    def load_rig(self) -> RigConfig:
+        """The rig as these options have it, at the task's station. Raises ConfigError."""
+        rig = at_address(load_rig(self.rig_file, self.task), self.host)
+        if self.robot not in (None, rig.robot):
+            raise ConfigError(f"--robot is {self.robot}, but rig {rig.name} ({self.rig_file}) is a {rig.robot}")
+        if self.headless and rig.robot == "xarm" and not rig.xarm.address.startswith("127."):
+            raise ConfigError(
+                f"--headless is for the twin and the fake controller: a real arm (at {rig.xarm.address}) needs "
+                "somebody who watches its page"
+            )
+        return rig
 
     def __post_init__(self) -> None:
         limits = {"trials": 0, "seed": 0, "torch_threads": 1, "max_attempts": 1}

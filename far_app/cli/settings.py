@@ -7,7 +7,7 @@ the paper's value, and an option given on the command line comes before both.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -45,13 +45,15 @@ def recommend(task: str, preset: str, checkpoint: Path) -> Path | None:
     return beside
 
 
-def parse(options: type[Options], arguments: Sequence[str], prog: str) -> Options:
+def parse(
+    options: type[Options], arguments: Sequence[str], prog: str,
+    adjust: Callable[[Options, RetryConfig], RetryConfig] = lambda options, retry: retry,
+) -> Options:  # fmt: skip
     """Options with the fields task, policy, settings and retry from the command line; what it does not say of retry
-    comes from the chosen settings."""
+    comes from the chosen settings, as `adjust` has them for this robot."""
     given: Any = tyro.cli(options, args=list(arguments), prog=prog)
-    if given.settings == "paper":
-        return given
-    found = recommended(given.task, given.policy)
+    chosen = RetryConfig() if given.settings == "paper" else recommended(given.task, given.policy)
+    found = adjust(given, chosen)
     return given if found == RetryConfig() else tyro.cli(
         options, args=list(arguments), prog=prog, default=options(retry=found)  # type: ignore[call-arg]
     )  # fmt: skip

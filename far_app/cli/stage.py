@@ -9,23 +9,27 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import http.client
+import math
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from far_app.cli.assemble import Parts, assemble, check_observation
+from far_app.cli.detector import failure_alarm, learned_detector
 from far_app.cli.options import RunOptions
 from far_app.cli.ports import choose_port
+from far_app.cli.preflight import policy_card, preflight
 from far_app.cli.processes import Child, Family, run_folder
 from far_app.config import TaskConfig
-from far_app.detectors import TwinCheck
+from far_app.detectors import PersonJudge, TwinCheck
 from far_app.endpoints import Endpoints
 from far_app.errors import FarError, RobotError
 from far_app.link import RemoteRobot
-from far_app.protocols import Method, PlanRequest, Policy
+from far_app.protocols import Method, PlanRequest, Policy, SuccessDetector
 from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
 from far_app.scheduling import PROMPT_NICENESS, nice
@@ -35,13 +39,23 @@ from far_app.session.publisher import TelemetryPublisher
 from far_app.session.realtime import prepare_process
 from far_app.session.recorder import Recorder
 from far_app.session.session import Session, SessionSettings
+from far_app.session.shadow import ShadowRobot
 from far_app.session.statistics import LoopStatistics
+from far_app.tasks import supervised
 from far_app.tasks import task as find_task
-from hw.rig import RigConfig, load_rig
+from hw.camera_config import with_views
+from hw.rig import RigConfig
+from hw.setup import setup_of
 
 HARDWARE_PATIENCE = 180.0
 """Seconds for the hw server's first observation (a first start compiles for a while)."""
 PAGE_PATIENCE = 60.0
+COUNTDOWN = 3.0
+"""Seconds for which a real arm's attempts are announced."""
+PAGE_SILENCE = 2.0
+"""Seconds without a page that someone looks at after which a real arm is held."""
+FIRST_STRETCH = 2
+"""Ticks that each tick of a session's first attempt takes on a real arm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +84,30 @@ class Stage:
             ),
         )  # fmt: skip
 
+    def _hardware_rules(self) -> dict[str, Any]:
+        """What a session on a real arm has that one on the twin has not."""
+        if self.rig.robot != "xarm":
+            return {}
+        watched = self.page is not None
+        return {
+            "countdown": COUNTDOWN if watched else 0.0, "await_scene": watched,
+            "page_silence": PAGE_SILENCE if watched else math.inf,
+            "first_stretch": 1 if self.options.full_speed else FIRST_STRETCH,
+        }  # fmt: skip
+
+    @contextlib.contextmanager
+    def detector(self) -> Iterator[SuccessDetector]:
+        """Who judges this stage's attempts, below the operator."""
+        options = self.options
+        wait = 0.0 if options.headless else options.judge_wait
+        if options.detector is not None:
+            with learned_detector(options, wait) as detector:
+                yield detector
+        elif self.task.judge == "person":
+            yield PersonJudge(wait)
+        else:
+            yield TwinCheck(self.task.success_ticks)
+
     @contextlib.contextmanager
     def session(
         self, writer: SessionWriter, inbox: IntentInbox, statistics: LoopStatistics, method: Method | None = None
@@ -82,16 +120,21 @@ class Stage:
         if self.page is not None:
             publisher = TelemetryPublisher(Endpoints.in_folder(self.folder).telemetry, statistics.health)
         try:
-            with revived(self.family, self.page):
-                yield Session(
+            with revived(self.family, self.page), self.detector() as detector:
+                robot = ShadowRobot(self.robot) if options.shadow else self.robot
+                session = Session(
                     settings=SessionSettings(
                         name=writer.folder.name, trials=options.trials, seed=options.seed, headless=options.headless,
-                        adaptation_limit=options.retry.adaptation_limit,
+                        adaptation_limit=options.retry.adaptation_limit, **self._hardware_rules(),
                     ),
-                    robot=self.robot, planner=ThreadedPlanner(), method=method or self.parts.method,
-                    detector=TwinCheck(self.task.success_ticks), task=self.task, scale=self.rig.scale_for(self.task),
+                    robot=robot, planner=ThreadedPlanner(), method=method or self.parts.method,
+                    detector=detector, task=self.task, scale=self.rig.scale_for(self.task),
                     recorder=Recorder(writer), inbox=inbox, statistics=statistics, publisher=publisher,
+                    alarm=failure_alarm(options),
                 )  # fmt: skip
+                if options.shadow:
+                    session.supervision.say("shadow run: plans are shown, the arm is held", "warning")
+                yield session
         finally:
             if publisher is not None:
                 publisher.close()
@@ -100,43 +143,50 @@ class Stage:
 @contextlib.contextmanager
 def stage(options: RunOptions) -> Iterator[Stage]:
     """Start everything, wait until it is ready, end everything. Raises the FarError of whatever cannot start."""
-    rig = load_rig(options.rig, options.task)
-    task = find_task(options.task, rig.arm)
-    port = 0 if options.headless else choose_port(options.host, options.port)
+    rig = options.load_rig()
+    task = with_views(find_task(options.task, rig.arm), rig.cameras)
+    task = task if rig.robot == "twin" else supervised(task)
+    port = 0 if options.headless else choose_port(options.page_host, options.port)
     with run_folder() as folder, contextlib.ExitStack() as stack:
         family = Family()
         stack.callback(family.end)
-        hardware = family.add(start_hardware(folder, options.rig, options.task))
-        page = None if options.headless else family.add(start_page(folder, options, port))
+        hardware = family.add(start_hardware(folder, options.rig_file, options.task, options.host))
+        page = None if options.headless else family.add(start_page(folder, options, port, task.cameras))
         parts = assemble(
             options.method, task, options.policy, options.critic, options.device, options.retry, options.engine
         )
-        task = dataclasses.replace(task, max_attempts=options.max_attempts or parts.max_attempts or task.max_attempts)
+        attempts = options.max_attempts or parts.max_attempts or task.max_attempts
+        task = dataclasses.replace(task, max_attempts=1 if options.shadow else attempts)
         # From here on this process's threads come before the machine's others: one that is not scheduled while it holds
         # the interpreter would keep the loop waiting. The processes above were started before, at the usual priority.
         nice(PROMPT_NICENESS)
         stack.callback(nice, 0)
         robot = stack.enter_context(connected(folder, hardware))
         if page is not None:
-            wait_for_page(page, options.host, port)
+            wait_for_page(page, options.page_host, port)
         check_observation(parts.method.policy.spec, robot.observe())
+        preflight(
+            parts.method.policy.spec, policy_card(task.name, options.policy), setup_of(rig, task), robot.observe(),
+            options.accept_differences or options.shadow,
+        )  # fmt: skip
         prepare_process(options.torch_threads)
         warm_up(parts.method.policy, robot)
         yield Stage(
             options=options, task=task, rig=rig, parts=parts, robot=robot, folder=folder, family=family,
             hardware=hardware, page=page,
-            page_url=f"http://{options.host}:{port}" if page is not None else "",
+            page_url=f"http://{options.page_host}:{port}" if page is not None else "",
         )  # fmt: skip
 
 
-def start_hardware(folder: Path, rig: str, task: str) -> Child:
+def start_hardware(folder: Path, rig: str, task: str, address: str) -> Child:
     arguments = ["--folder", str(folder), "--rig", rig, "--task", task, "--parent", str(os.getpid())]
+    arguments += ["--address", address] * bool(address)
     return Child("hardware", "hw.server", arguments, folder)
 
 
-def start_page(folder: Path, options: RunOptions, port: int) -> Child:
-    arguments = ["--run-folder", str(folder), "--host", options.host, "--port", str(port)]
-    arguments += ["--recordings", str(options.recordings.absolute())]
+def start_page(folder: Path, options: RunOptions, port: int, cameras: Sequence[str]) -> Child:
+    arguments = ["--run-folder", str(folder), "--host", options.page_host, "--port", str(port)]
+    arguments += ["--cameras", *cameras, "--recordings", str(options.recordings.absolute())]
     arguments += ["--no-scene3d"] * (not options.scene3d) + ["--no-rerun"] * (not options.rerun)
     return Child("page", "ui.server", arguments, folder)
 

@@ -48,7 +48,7 @@ def main(arguments: Sequence[str]) -> int:
 
     from far_app.cli.settings import recommend
     from far_app.learning.dataset import read_episodes
-    from far_app.learning.policy import load_policy
+    from far_app.learning.policy import load_policy, trained_framings
     from far_app.learning.train_critic import CriticTraining, train_critic
 
     torch.set_num_threads(options.threads)
@@ -59,10 +59,10 @@ def main(arguments: Sequence[str]) -> int:
     )  # fmt: skip
     if options.iterations is not None:
         training = dataclasses.replace(training, iterations=options.iterations)
-    cameras = policy.config.cameras
+    cameras, size, framings = policy.config.cameras, policy.config.image_size, trained_framings(path)
     data = options.data or Path("datasets") / f"{options.task}.hdf5"
-    demonstrations = read_episodes(data, cameras, options.demonstrations)
-    attempts = [episode for file in options.attempts for episode in read_episodes(file, cameras)]
+    demonstrations = read_episodes(data, cameras, options.demonstrations, size, framings)
+    attempts = [e for file in options.attempts for e in read_episodes(file, cameras, None, size, framings)]
     card: dict[str, object] = {"command": "far train critic " + " ".join(arguments)}
     checkpoint = train_critic(demonstrations, attempts, policy, training, options.out or path.parent, card)
     log.info("wrote %s", checkpoint)

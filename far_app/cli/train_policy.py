@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import tyro
 
 from far_app.errors import CheckpointError
@@ -29,6 +30,10 @@ class TrainPolicyOptions:
     """Use the first so many of them."""
     out: Path | None = None
     """Folder of the run; runs/TASK-PRESET by default."""
+    cameras: tuple[str, ...] | None = None
+    """The views it looks through; the preset's (front and wrist) by default. The paper's real arm has front alone."""
+    rig: str | None = None
+    """The dataset's pictures are whole frames of this rig's cameras: cut and shrink them as its live ones."""
     iterations: int | None = None
     """The preset's number by default."""
     seed: int = 0
@@ -46,16 +51,22 @@ def main(arguments: Sequence[str]) -> int:
     import torch
 
     from far_app.cli.assemble import check_device
-    from far_app.learning.dataset import read_episodes
+    from far_app.learning.dataset import read_episodes, read_setup
     from far_app.learning.imagenet import resnet18_weights
     from far_app.learning.policy import preset
     from far_app.learning.train_policy import TRAININGS, train_policy
+    from far_app.preflight import colours_of
     from far_app.tasks import task as find_task
+    from hw.camera_config import views_of, with_views
+    from hw.rig import load_rig
+    from hw.setup import setup_of
 
     check_device(options.device)
     torch.set_num_threads(options.threads)
     task = find_task(options.task)
     config = dataclasses.replace(preset(options.preset, task.name), norm=options.norm)
+    if options.cameras is not None:
+        config = dataclasses.replace(config, cameras=options.cameras)
     training = dataclasses.replace(TRAININGS[options.preset], seed=options.seed)
     if options.iterations is not None:
         training = dataclasses.replace(training, iterations=options.iterations)
@@ -65,11 +76,19 @@ def main(arguments: Sequence[str]) -> int:
             weights = resnet18_weights(options.imagenet)
         except CheckpointError as error:
             log.warning("%s; training starts from random weights", error)
-    episodes = read_episodes(
-        options.data or Path("datasets") / f"{task.name}.hdf5", config.cameras, options.demonstrations
-    )
+    data = options.data or Path("datasets") / f"{task.name}.hdf5"
+    setup, framings = read_setup(data), None
+    if options.rig is not None:
+        rig = load_rig(options.rig, task.name)
+        framings = views_of(rig.cameras or {})
+        setup = setup_of(rig, with_views(find_task(task.name, rig.arm), rig.cameras)).table()
+    episodes = read_episodes(data, config.cameras, options.demonstrations, config.image_size, framings)
     folder = options.out or Path("runs") / f"{task.name}-{options.preset}"
     card: dict[str, object] = {"command": "far train policy " + " ".join(arguments)}
+    if setup is not None:
+        card["setup"] = setup
+    if config.cameras:
+        card["colours"] = {c: colours_of(np.concatenate([e.images[c][::8] for e in episodes])) for c in config.cameras}
     path = train_policy(episodes, config, training, folder, options.device, card, weights)
     log.info("wrote %s", path)
     return 0

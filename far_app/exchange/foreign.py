@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
 from far_app.errors import ConfigError, RecordingError
+from far_app.picture import Framing, seen
 from far_app.types import ACTION_DIM
 
 FIRST_SCENE = 2_000_000
@@ -30,7 +30,7 @@ class Foreign:
     gripper: tuple[float, float] | None = None
     """The file's gripper reading when closed and when open; needed where the gripper is not known."""
     image_size: int | None = None
-    """Pixels to scale pictures to; as they are by default."""
+    """Pixels to cut and scale pictures to; whole and as they are by default."""
 
 
 def cameras(wanted: Mapping[str, str], known: Mapping[str, Sequence[str]], there: Sequence[str]) -> dict[str, str]:
@@ -78,14 +78,10 @@ def actions(rows: np.ndarray, what: str) -> np.ndarray:
 
 
 def pictures(frames: np.ndarray, size: int | None, what: str) -> np.ndarray:
-    """uint8 N × S × S × 3, scaled where asked."""
+    """uint8 N × H × W × 3; where asked, the picture of that size that a policy would see of each."""
     if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3:
         raise RecordingError(f"{what} holds {frames.dtype} {frames.shape}; pictures are uint8 N × H × W × 3")
-    if size is not None and frames.shape[1:3] != (size, size):
-        frames = np.stack([cv2.resize(f, (size, size), interpolation=cv2.INTER_AREA) for f in frames])
-    if frames.shape[1] != frames.shape[2]:
-        raise ConfigError(f"{what} is {frames.shape[2]}×{frames.shape[1]}, must be square; scale it: --image-size 84")
-    return frames
+    return frames if size is None else np.stack([seen(frame, Framing(), size) for frame in frames])
 
 
 def unused(there: Iterable[str], used: Iterable[str]) -> list[str]:

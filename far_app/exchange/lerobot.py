@@ -26,12 +26,17 @@ _EPISODES_AT_ONCE = 200
 
 
 def write_lerobot(
-    path: Path, rollouts: Iterable[Rollout], fps: float, robot: str, instruction: Callable[[str], str], overwrite: bool
+    path: Path,
+    rollouts: Iterable[Rollout],
+    fps: float,
+    env_args: dict[str, Any],
+    instruction: Callable[[str], str],
+    overwrite: bool,
 ) -> int:
-    """The number of episodes. `instruction` words a task. Raises ConfigError when there are none, or when two differ
-    in what they hold."""
+    """The number of episodes. `env_args`: where they come from, as robomimic has it; `instruction` words a task. Raises
+    ConfigError when there are none, or when two differ in what they hold."""
     with whole(path, overwrite) as half:
-        dataset = _Dataset(half, fps, robot)
+        dataset = _Dataset(half, fps, env_args)
         for rollout in rollouts:
             dataset.add(rollout, instruction(rollout.provenance.task))
         return dataset.finish()
@@ -40,8 +45,8 @@ def write_lerobot(
 class _Dataset:
     """A dataset that grows by whole episodes."""
 
-    def __init__(self, root: Path, fps: float, robot: str) -> None:
-        self.root, self.fps, self.robot = root, int(fps) if float(fps).is_integer() else fps, robot
+    def __init__(self, root: Path, fps: float, env_args: dict[str, Any]) -> None:
+        self.root, self.fps, self.env_args = root, int(fps) if float(fps).is_integer() else fps, env_args
         self.features: dict[str, Any] = {}
         self.tasks: dict[str, int] = {}
         self.frames = self.episodes = 0
@@ -105,11 +110,12 @@ class _Dataset:
         plain = {name: {key: value.tolist() for key, value in of.items()} for name, of in stats.items()}
         (self.root / v3.STATS).write_text(json.dumps(plain, indent=1, allow_nan=False))
         info = {
-            "codebase_version": v3.VERSION, "robot_type": self.robot, "total_episodes": self.episodes,
+            "codebase_version": v3.VERSION, "robot_type": self.env_args["env_kwargs"]["robots"],
+            "total_episodes": self.episodes,
             "total_frames": self.frames, "total_tasks": len(self.tasks), "chunks_size": v3.CHUNK_SIZE,
             "data_files_size_in_mb": v3.FILE_MEGABYTES, "video_files_size_in_mb": 200, "fps": self.fps,
             "splits": {"train": f"0:{self.episodes}"}, "data_path": v3.DATA, "video_path": None,
-            "features": self.features,
+            "features": self.features, v3.ENV_ARGS: self.env_args,
         }  # fmt: skip
         (self.root / v3.INFO).write_text(json.dumps(info, indent=1))
         return self.episodes

@@ -19,6 +19,8 @@ INFO, STATS, TASKS = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
 EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 FINAL = "far/final.parquet"
+ENV_ARGS = "far_env_args"
+"""Our key of info.json: where the episodes come from, as robomimic's env_args and far_app/preflight.py have it."""
 CHUNK_SIZE = 1000
 """Files in a folder."""
 FILE_MEGABYTES = 100

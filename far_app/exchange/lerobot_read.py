@@ -57,10 +57,15 @@ def read_lerobot(
     for line in [*mapping, *foreign.unused(features, used)]:
         say(line)
     rows = list(_episode_rows(root))
-    name = rows[0].get("far/task") or (rows[0]["tasks"] or ["unknown"])[0]
-    environment = TASKS[name].environment if name in TASKS else name
-    env_args = {"env_name": environment, "type": 1, "env_kwargs": {"robots": info.get("robot_type")}}
+    env_args = info.get(v3.ENV_ARGS) or foreign_env_args(info, rows[0])
     return env_args, _episodes(root, info, rows, seen, options, say)
+
+
+def foreign_env_args(info: dict[str, Any], row: dict[str, Any]) -> dict[str, object]:
+    """Where a dataset of other programs comes from, as far as it says."""
+    name = (row["tasks"] or ["unknown"])[0]
+    environment = TASKS[name].environment if name in TASKS else name
+    return {"env_name": environment, "type": 1, "env_kwargs": {"robots": info.get("robot_type")}}
 
 
 def _info(root: Path) -> dict[str, Any]:

@@ -4,12 +4,16 @@ data/demo_N                 attrs: num_samples, seed, success
     actions (N, 7)   rewards (N,)   dones (N,)
     obs/front_image, obs/wrist_image (N, S, S, 3) uint8
     obs/robot0_eef_pos (N, 3)  obs/robot0_eef_quat (N, 4) xyzw  obs/robot0_gripper (N, 1)  obs/object (N, K)
-data attrs: total, env_args (JSON with env_name, type, env_kwargs)
+data attrs: total, env_args (JSON with env_name, type, env_kwargs, and setup: far_app/preflight.py)
+
+Pictures of S × S pixels, the policy's size, are what a policy saw. Others (datasets made elsewhere) are whole frames,
+and become pictures by the very function that frames live ones (far_app/picture.py).
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from far_app.errors import ConfigError, RecordingError
+from far_app.picture import Framing, seen
 from far_app.types import Attempt, Observation
 
 
@@ -97,8 +102,31 @@ def last_scene(path: Path) -> int:
     return max(scenes) - min(scenes) + 1 if scenes else 0
 
 
-def read_episodes(path: Path, cameras: tuple[str, ...], limit: int | None = None) -> list[Episode]:
-    """The first `limit` demonstrations, decoded."""
+def read_setup(path: Path) -> dict[str, Any] | None:
+    """What a file says of the robot its episodes come from; None where it says nothing."""
+    if not path.exists():
+        return None
+    with h5py.File(path, "r") as file:
+        raw = file["data"].attrs.get("env_args") if "data" in file else None
+    return json.loads(raw).get("setup") if raw else None
+
+
+def pictures(frames: Any, size: int | None, framing: Framing) -> UInt8[np.ndarray, "N S S 3"]:
+    """A dataset's stored frames as a policy of that picture size sees them; as they are without a size."""
+    if size is None or frames.shape[1:3] == (size, size):
+        return frames[:]
+    return np.stack([seen(frame, framing, size) for frame in frames])
+
+
+def read_episodes(
+    path: Path,
+    cameras: tuple[str, ...],
+    limit: int | None = None,
+    size: int | None = None,
+    framings: Mapping[str, Framing] | None = None,
+) -> list[Episode]:
+    """The first `limit` demonstrations, decoded, their pictures of `size` pixels; `framings`: how the cameras' whole
+    frames are cut, where that is what the file holds."""
     if not path.exists():
         raise RecordingError(f"no demonstrations at {path}; make some with `far demo`")
     episodes = []
@@ -115,7 +143,9 @@ def read_episodes(path: Path, cameras: tuple[str, ...], limit: int | None = None
                 [group["obs"][k][:] for k in ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper")], axis=1
             )
             episodes.append(Episode(
-                images={c: group["obs"][f"{c}_image"][:] for c in cameras}, states=states.astype(np.float32),
+                images={c: pictures(group["obs"][f"{c}_image"], size, (framings or {}).get(c, Framing()))
+                        for c in cameras},
+                states=states.astype(np.float32),
                 actions=group["actions"][:], rewards=group["rewards"][:], successes=group["dones"][:].astype(bool),
                 success=bool(group.attrs["success"]), seed=int(group.attrs["seed"]),
                 objects=group["obs"]["object"][:] if "object" in group["obs"] else None,

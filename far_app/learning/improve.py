@@ -22,7 +22,7 @@ from far_app.learning.critic_file import encoder_fingerprint, load_critic, load_
 from far_app.learning.critic_source import Features, encoded, policy_features
 from far_app.learning.dataset import Episode
 from far_app.learning.pairs import AWR_INVERSE_TEMPERATURE, AWR_WEIGHT_LIMIT
-from far_app.learning.policy import DiffusionPolicy, load_policy
+from far_app.learning.policy import DiffusionPolicy, load_policy, read_card
 from far_app.learning.train_critic import CriticTraining, fit
 from far_app.learning.train_policy import TRAININGS, PolicyTraining, train_policy
 from far_app.learning.transitions import Backup, chunked
@@ -73,9 +73,10 @@ def learn(
     critic = load_critic(better, policy)
     shown = [*experience.demonstrations, *experience.succeeded]
     weights = np.concatenate([advantage_weights(policy, critic, e) for e in shown])
+    known = {k: v for k, v in read_card(policy_path).items() if k in ("setup", "colours")}
     path = train_policy(
         shown, policy.config, policy_training, folder, start=policy, weights=weights / weights.mean(),
-        card={"improved from": policy_path.name, "demonstrations": len(experience.demonstrations),
+        card=known | {"improved from": policy_path.name, "demonstrations": len(experience.demonstrations),
               "successes": len(experience.succeeded), "failures": len(experience.failed)},
     )  # fmt: skip
     return path, better

@@ -25,6 +25,8 @@ from far_app.learning.diffusion import ddim_sample
 from far_app.learning.encoder import ObservationEncoder
 from far_app.learning.state import state_dim, state_of
 from far_app.learning.unet import ConditionalUnet1d
+from far_app.picture import Framing
+from far_app.preflight import setup_from
 from far_app.protocols import OWN_STATE, History, PolicySpec
 from far_app.tasks import TASKS
 from far_app.types import ACTION_DIM
@@ -210,6 +212,15 @@ def load_policy(path: Path, task: str | None = None, device: str = "cpu") -> Dif
 
 
 def read_card(path: Path) -> dict[str, object]:
-    """The model card stored with a checkpoint."""
+    """The model card stored with a checkpoint; for one made before cards told of the setup, with what a NAMEsetup.json
+    beside its NAMEpolicy.safetensors adds."""
+    beside = path.with_name(path.name.removesuffix("policy.safetensors") + "setup.json")
+    added = json.loads(beside.read_text()) if beside != path and beside.exists() else {}
     with safe_open(path, framework="pt") as file:
-        return json.loads((file.metadata() or {}).get("card", "{}"))
+        return added | json.loads((file.metadata() or {}).get("card", "{}"))
+
+
+def trained_framings(path: Path) -> dict[str, Framing]:
+    """How the cameras of a policy's data were cut, by view; empty where its card does not say."""
+    setup = setup_from(read_card(path).get("setup"))
+    return {name: view.framing for name, view in setup.views.items()} if setup is not None else {}

@@ -97,6 +97,11 @@ class RetryMethod:
             return nothing
         learning = _Learning(self, attempt, outdated, nothing)
         try:
+            if self.config.fcpa.hedge and version != BASE_VERSION:
+                learning.attribute(progress)
+                self._withdraw(outdated)
+                learning.note(status="withdrawn", version=BASE_VERSION, note="the lesson failed: a plain try next")
+                return learning.adaptation
             denoiser, pairs = learning.run(progress)
             if denoiser is not None:
                 self._become(denoiser, pairs, outdated)
@@ -117,6 +122,12 @@ class RetryMethod:
         self.adapted = None
         self.rounds: list[Pairs] = []
         self._adaptations = 0
+
+    def _withdraw(self, outdated: Cancelled) -> None:
+        """The base policy acts again; what was learnt stays known for the next lesson."""
+        with self._swap:
+            check(outdated)
+            self.acting, self.policy = self.base, self._base_policy
 
     def _become(self, denoiser: nn.Module, pairs: Pairs, outdated: Cancelled) -> None:
         """Swap the acting policy, unless a new trial began or nobody waits any more."""
@@ -159,16 +170,21 @@ class _Learning:
             self._last = now
         self.adaptation = replace(self.adaptation, seconds=seconds, **changes)
 
-    def run(self, progress: Progress) -> tuple[nn.Module | None, Pairs]:
-        """The adapted denoiser (None when nothing changed) and the pairs it learnt from."""
-        method, config = self.method, self.method.config
-        critic = method.critic
+    def attribute(self, progress: Progress) -> Critic:
+        """Find the chunks to blame; returns the critic that did."""
+        critic = self.method.critic
         assert critic is not None, "checked when the method was made"
         self.adaptation = evidence.attributed(
-            self.adaptation, self.attempt, method.base, critic, config.attribution, self.cancelled
+            self.adaptation, self.attempt, self.method.base, critic, self.method.config.attribution, self.cancelled
         )
         self.note("attribution")
         progress(self.adaptation)
+        return critic
+
+    def run(self, progress: Progress) -> tuple[nn.Module | None, Pairs]:
+        """The adapted denoiser (None when nothing changed) and the pairs it learnt from."""
+        method, config = self.method, self.method.config
+        critic = self.attribute(progress)
         awr = config.fcpa.objective == "awr"
         pairs = self._trajectory(critic) if awr else self._pairs(critic, self.adaptation.flagged)
         self.note("pairs", pairs=len(pairs), empty_states=pairs.empty_states)

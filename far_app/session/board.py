@@ -34,6 +34,8 @@ class Board:
         """The running or latest adaptation of the trial."""
         self._began = time.monotonic()
         self.reason = ""
+        self.countdown = 0.0
+        """Seconds until an announced attempt begins."""
         self.refusal = ""
         self.adaptation_steps: tuple[AdaptationStep, ...] = ()
         self.adapting = False
@@ -75,12 +77,12 @@ class Board:
         self.adapting, self._latest = False, adaptation
         self.adaptation_steps = adaptation.history or self.adaptation_steps
 
-    def trial_ended(self, trial: Trial, judged_by: str, note: str) -> None:
+    def trial_ended(self, trial: Trial, judged_by: str, note: str, counted: bool = True) -> None:
         self._history.append(
             TrialRow(
                 trial=self.trial, scene_seed=self.scene_seed, attempts=len(trial.attempts), success=trial.success,
                 judged_by=judged_by, flagged=sum(len(a.flagged) for a in trial.adaptations),
-                seconds=time.monotonic() - self._began, note=note,
+                seconds=time.monotonic() - self._began, note=note, counted=counted,
             )
         )  # fmt: skip
 
@@ -92,9 +94,9 @@ class Board:
         if self.adapting and status in ("", "none"):
             status = "update" if self.adaptation_steps else "attribution" if latest is None else "candidates"
         return Telemetry(
-            seq=0, stamp=0.0, state=state, reason=self.reason, session=self._session, task=self._task.name,
-            method=self._method, policy_version=self.policy_version, trial=self.trial, trials=self._trials,
-            attempt=self.attempt, max_attempts=self._task.max_attempts, scene_seed=self.scene_seed,
+            seq=0, stamp=0.0, state=state, reason=self.reason, countdown=self.countdown, session=self._session,
+            task=self._task.name, method=self._method, policy_version=self.policy_version, trial=self.trial,
+            trials=self._trials, attempt=self.attempt, max_attempts=self._task.max_attempts, scene_seed=self.scene_seed,
             tick=len(self._values), horizon=self._task.horizon, rate=self._task.rate, chunk_horizon=self._chunk_horizon,
             values=np.array(values, dtype=float),
             value_changes=curve.value_changes if curve else np.zeros(0),

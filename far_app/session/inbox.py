@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import queue
 import threading
+import time
 
 import zmq
 
 from far_app.session_states import Intent
-from far_app.telemetry import OperatorIntent
+from far_app.telemetry import OperatorIntent, PagePresence
 from far_app.wire import WireError, unpack
 
 log = logging.getLogger(__name__)
@@ -20,6 +21,8 @@ class IntentInbox:
 
     def __init__(self, endpoint: str | None = None) -> None:
         self._queue: queue.SimpleQueue[Intent] = queue.SimpleQueue()
+        self.looked_at = time.monotonic()
+        """When somebody was last known to have the page open."""
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         if endpoint is not None:
@@ -57,3 +60,5 @@ class IntentInbox:
             if isinstance(message, OperatorIntent):
                 log.info("operator: %s", message.intent)
                 self._queue.put(message.intent)
+            elif isinstance(message, PagePresence) and message.clients > 0:
+                self.looked_at = time.monotonic()

@@ -9,9 +9,11 @@ Called by `far run` and `far bench loop`. Whatever ends it, the arm is held and 
 from __future__ import annotations
 
 import logging
+import math
 import time
 from dataclasses import dataclass, field, replace
 
+from far_app.alarm import Alarm
 from far_app.config import TaskConfig
 from far_app.detectors import OperatorOverride
 from far_app.errors import RobotError
@@ -31,7 +33,17 @@ from far_app.session.statistics import LoopStatistics
 from far_app.session.supervision import Freshness, Supervision, TrialAbandoned
 from far_app.session.watched import WatchedRobot
 from far_app.session_states import Happening, State
-from far_app.trial import Adapted, AfterHold, AttemptEnded, AttemptStarted, Event, RunningAdaptation, Tick, trial
+from far_app.trial import (
+    NO_ALARM,
+    Adapted,
+    AfterHold,
+    AttemptEnded,
+    AttemptStarted,
+    Event,
+    RunningAdaptation,
+    Tick,
+    trial,
+)
 from far_app.types import Adaptation, Attempt, Step, Trial
 
 log = logging.getLogger(__name__)
@@ -50,6 +62,15 @@ class SessionSettings:
     adaptation_limit: float = 60.0
     """Seconds after which a retry no longer waits for its adaptation."""
     freshness: Freshness = field(default_factory=Freshness)
+    await_scene: bool = False
+    """Real arm: before each trial the arm is held until the operator has rebuilt the scene and cleared the
+    workspace."""
+    countdown: float = 0.0
+    """Real arm: seconds for which each attempt is announced; a pause or a stop cancels it."""
+    page_silence: float = math.inf
+    """Real arm: seconds without a page that someone looks at after which the arm is held until Resume."""
+    first_stretch: int = 1
+    """Real arm: ticks that each tick of the session's first attempt takes; that trial is left out of statistics."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +81,8 @@ class TrialResult:
     attempts: int
     success: bool
     judged_by: str
+    counted: bool = True
+    """False for a trial that began at reduced speed."""
 
 
 class Session:
@@ -77,8 +100,9 @@ class Session:
         inbox: IntentInbox,
         statistics: LoopStatistics,
         publisher: TelemetryPublisher | None = None,
+        alarm: Alarm = NO_ALARM,
     ) -> None:
-        self.settings, self.task, self.scale = settings, task, scale
+        self.settings, self.task, self.scale, self.alarm = settings, task, scale, alarm
         self.planner, self.method, self.recorder, self.statistics = planner, method, recorder, statistics
         self.robot = WatchedRobot(robot, statistics)
         self.detector = OperatorOverride(detector)
@@ -90,6 +114,7 @@ class Session:
         self.supervision = Supervision(
             robot=self.robot, override=self.detector, planner=planner, recorder=recorder, board=self.board, inbox=inbox,
             clock=self.clock, publisher=publisher, freshness=settings.freshness, headless=settings.headless,
+            page_silence=settings.page_silence,
         )  # fmt: skip
         self.results: list[TrialResult] = []
         self.last_failure: Attempt | None = None
@@ -100,6 +125,7 @@ class Session:
         self._adaptations: list[Adaptation] = []
         self._seed = self._tick = self._recorded = self._reported = 0
         self._in_attempt = False
+        self._stretch = 1
 
     # ── trials ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -113,6 +139,8 @@ class Session:
                 while self._between_trials():
                     if self.settings.trials and number == self.settings.trials:
                         supervision.happen(Happening.NO_MORE_TRIALS)
+                        break
+                    if self.settings.await_scene and not supervision.await_scene():
                         break
                     number += 1
                     self._run_trial(number, self.settings.seed + number - 1)
@@ -138,9 +166,11 @@ class Session:
         self.board.trial_started(number, seed)
         self.recorder.begin_trial(number, seed)
         supervision.say(f"trial {number}: scene {seed}")
+        self._stretch = self.settings.first_stretch if number == 1 else 1
         events = trial(
-            seed, self.robot, self.planner, self.method, self.detector, self.task, self.scale, self._start_adaptation
-        )
+            seed, self.robot, self.planner, self.method, self.detector, self.task, self.scale, self._start_adaptation,
+            self._stretch, self.alarm,
+        )  # fmt: skip
         answer: float | None = None
         try:
             while True:
@@ -175,6 +205,9 @@ class Session:
         if tick.step is not None and tick.step.tick == self._recorded:
             self._record(tick.step)
         self._report()
+        if tick.phase == "judging" and not self.board.reason:
+            self.board.reason = f"success or failure? Say so within {self.detector.patience:g} s, or it is a failure"
+            self.supervision.say(self.board.reason)
         self.supervision.show()
         due = self.clock.wait()
         held = self.supervision.attend(tick.phase)
@@ -183,14 +216,20 @@ class Session:
             self.clock.restart()
             due = AfterHold(self.clock.wait())
             self.supervision.attend(tick.phase)
-        self._tick += 1
+        self._tick += not tick.between
         return due
 
     def _attempt_started(self, event: AttemptStarted) -> None:
+        slowly = self._stretch > 1 and event.attempt_index == 1
+        pace = f" at 1/{self._stretch} speed, not counted" if slowly else ""
+        self.supervision.count_down(self.settings.countdown, f"attempt {event.attempt_index}{pace}")
         self.supervision.happen(Happening.AT_HOME)
         self.supervision.no_lesson = False
         self.board.attempt_started(event.attempt_index, event.policy_version)
         self.recorder.begin_attempt(event.attempt_index, event.policy_version)
+        if slowly:
+            self.supervision.say(f"attempt {event.attempt_index} runs at 1/{self._stretch} of the policy's speed")
+            self.recorder.event("reduced_speed", pace.strip(), {"stretch": self._stretch})
         self._recorded = self._tick = 0
         self._in_attempt = True
         self._prime()
@@ -234,11 +273,16 @@ class Session:
         result = Trial(scene_seed=self._seed, attempts=tuple(self._attempts), adaptations=tuple(self._adaptations))
         last = self._attempts[-1].outcome if self._attempts else None
         judged_by = last.judged_by.value if last else ""
-        self.board.trial_ended(result, judged_by, last.note if last else "no attempt was finished")
+        counted = self._stretch == 1
+        note = last.note if last else "no attempt was finished"
+        self.board.trial_ended(result, judged_by, note if counted else f"began at reduced speed; {note}", counted)
         self.recorder.end_trial(result.success, len(result.attempts))
         self.results.append(
-            TrialResult(seed=self._seed, attempts=len(result.attempts), success=result.success, judged_by=judged_by)
-        )
+            TrialResult(
+                seed=self._seed, attempts=len(result.attempts), success=result.success, judged_by=judged_by,
+                counted=counted,
+            )
+        )  # fmt: skip
 
     def _finish(self) -> None:
         """Hold the arm, close the recording, show the last state."""

@@ -7,12 +7,13 @@ held, until the operator lets things go on.
 from __future__ import annotations
 
 import logging
+import math
 import time
 from dataclasses import dataclass
 
 from far_app.detectors import OperatorOverride
 from far_app.errors import FarError, RobotError
-from far_app.protocols import Hold, Home, Resume
+from far_app.protocols import Heartbeat, Hold, Home, Resume
 from far_app.session.board import Board
 from far_app.session.clock import TickClock
 from far_app.session.inbox import IntentInbox
@@ -26,6 +27,8 @@ from far_app.types import Judge, Outcome, RobotMode, RobotStatus
 log = logging.getLogger(__name__)
 
 RESTING = (State.PAUSED, State.STOPPED, State.FAULT)
+MOVING = (State.HOMING, State.RUNNING, State.ADAPTING)
+"""States in which the arm may move."""
 
 
 class SessionFault(FarError):
@@ -58,10 +61,13 @@ class Supervision:
         publisher: TelemetryPublisher | None,
         freshness: Freshness,
         headless: bool,
+        page_silence: float = math.inf,
     ) -> None:
         self.robot, self.override, self.planner, self.recorder = robot, override, planner, recorder
         self.board, self.inbox, self.clock, self.publisher = board, inbox, clock, publisher
         self.freshness, self.headless = freshness, headless
+        self.page_silence = page_silence
+        """Seconds without a page that someone looks at, after which the arm is held."""
         self.state = State.READY
         self.skipping = False
         """The operator skips this trial: it ends with its running attempt."""
@@ -130,6 +136,43 @@ class Supervision:
             self._notice(phase)
         self.clock.restart()
 
+    def await_scene(self) -> bool:
+        """Hold until the operator has rebuilt the scene and says that the workspace is clear; False when the session
+        ended instead."""
+        self._hold("waiting for the scene")
+        while self.state is not State.FINISHED:
+            if self.state in (State.READY, State.TRIAL_DONE):
+                self.happen(Happening.NEED_SCENE)
+            self.show()
+            time.sleep(self.clock.period)
+            self._fetch()
+            for intent in self.inbox.drain():
+                asked = self.state
+                self._ask(intent, "between")
+                if asked is State.AWAITING_SCENE and self.state is State.READY:
+                    return True
+            self._notice("between")
+            self.rest("between")
+        return False
+
+    def count_down(self, seconds: float, what: str) -> None:
+        """Announce a motion; it begins when the time is over and the arm still stands at home. A pause or a stop
+        cancels it, and after Resume it is announced anew. Raises TrialAbandoned as `attend` does."""
+        begins = time.monotonic() + seconds
+        while (left := begins - time.monotonic()) > 0.0:
+            self.board.countdown = float(math.ceil(left))
+            self.board.reason = f"{what} begins in {math.ceil(left)} s: Pause or STOP cancels"
+            self.show()
+            time.sleep(self.clock.period)
+            self.robot.request(Heartbeat())
+            try:
+                held = self.attend("homing")
+            finally:
+                self.board.countdown = 0.0
+            if held or (self.robot.newest is not None and not self.robot.newest.status.at_home):
+                begins = time.monotonic() + seconds
+        self.board.reason = ""
+
     def fault(self, reason: str, lesson: bool = False) -> None:
         """Hold the arm, end the attempt as a failure (one to learn from or not), explain; only the operator clears
         it."""
@@ -159,8 +202,19 @@ class Supervision:
             self.fault(status.reason or "the arm reports a fault", lesson=True)  # the policy's own doing
         elif latched and self.state not in (State.STOPPED, State.FAULT, State.FINISHED):
             self._stopped(Happening.LATCH, status.reason or "STOP")
+        if phase == "homing" and self.state in (State.HOMING, State.ADAPTING) and status.mode is RobotMode.HOMING:
+            self.board.reason = status.reason  # what the way home waits for
         if phase == "attempt" and self.planner.failure is not None:
             self.fault(str(self.planner.failure))
+        unseen = time.monotonic() - self.inbox.looked_at
+        if self.state in MOVING and unseen > self.page_silence:
+            self._hold("nobody has the page open")
+            self.happen(Intent.PAUSE)
+            self.board.reason = (
+                f"nobody has had the page open for {unseen:.1f} s (limit {self.page_silence:g} s): the arm is held; "
+                "look at it, then press Resume"
+            )
+            self.say(self.board.reason, "warning")
         if self.recorder.error is not None:
             self._hold(str(self.recorder.error))
             raise self.recorder.error
@@ -197,12 +251,16 @@ class Supervision:
 
     def _drain(self, phase: str) -> None:
         for intent in self.inbox.drain():
-            why = refusal(self.state, intent)
-            self.board.refusal = why
-            if why:
-                self.say(why, "warning")
-            else:
-                self._obey(intent, phase)
+            self._ask(intent, phase)
+
+    def _ask(self, intent: Intent, phase: str) -> None:
+        """Refuse an intent with a reason, or obey it."""
+        why = refusal(self.state, intent)
+        self.board.refusal = why
+        if why:
+            self.say(why, "warning")
+        else:
+            self._obey(intent, phase)
 
     def _obey(self, intent: Intent, phase: str) -> None:
         """Do what an intent asks and take its transition."""
@@ -211,6 +269,8 @@ class Supervision:
             case Intent.STOP:
                 self._hold("STOP pressed by the operator", latch=True)
                 return self._stopped(Intent.STOP, "STOP pressed by the operator")
+            case Intent.RESUME if self.state in (State.HOMING, State.ADAPTING):
+                self._answer_the_way_home()
             case Intent.RESUME if self.state is not State.PAUSED and not self._unlatch():
                 return None
             case Intent.PAUSE:
@@ -241,6 +301,14 @@ class Supervision:
             self.board.reason = reason
         self.happen(event)
         self.say(reason, "warning")
+
+    def _answer_the_way_home(self) -> None:
+        """The operator has taken what the hand holds: it may open (tasks whose release is "ask")."""
+        try:
+            self.robot.request(Resume())
+        except RobotError as error:
+            self.board.refusal = str(error)
+            self.say(str(error), "error")
 
     def _unlatch(self) -> bool:
         """Ask the hw server to leave its latch; what it answers is shown when it refuses."""

@@ -111,9 +111,11 @@ def _success(found: Sequence[Group]) -> str:
         cells += [""] * (last - group.max_attempts)
         attempts = [trial.attempts for trial in group.trials]
         rows.append(_row([*cells, f"{np.mean(attempts):.2f}" if attempts else "–"]))
-    head = ["method", "trials", "unfinished", *(f"within {k}" for k in range(1, last + 1)), "attempts a trial"]
-    note = '<p class="dim">Brackets: 95 % Wilson intervals. Unfinished trials (skipped, cut off) are in no figure.</p>'
-    return _table(head, rows) + note
+    head = ["method", "trials", "left out", *(f"within {k}" for k in range(1, last + 1)), "attempts a trial"]
+    note = (
+        "Brackets: 95 % Wilson intervals. Left out, and in no figure: trials skipped, cut off, begun at reduced speed."
+    )
+    return f'{_table(head, rows)}<p class="dim">{note}</p>'
 
 
 def _differences(found: Sequence[Group]) -> str:

@@ -14,6 +14,7 @@ import pytest
 from far_app.cli import main
 from far_app.exchange.feature_stats import STATISTICS, array_stats, histogram, image_stats
 from far_app.learning.dataset import Episode, read_episodes
+from far_app.preflight import setup_from
 from far_app.recording.episodes import session_episodes
 from far_app.recording.reader import read_session
 from far_app.recording.schema import SessionInfo
@@ -168,3 +169,17 @@ def test_a_session_without_cameras_or_objects_comes_back_too(to, tmp_path):
     for name in ("states", "actions", "rewards", "successes"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
     assert theirs.successes.tolist() == [False] * 4 + [True], "the operator's success counts from the last tick"
+
+
+def test_where_the_episodes_come_from_comes_along(tmp_path):
+    """What `far demo` notes of its robot, an export notes too, and an import keeps."""
+    sample, notes = Path(__file__).parents[2] / "recordings/sample", []
+    for to in ("lerobot", "robomimic"):
+        out, back = tmp_path / to, tmp_path / f"{to}.hdf5"
+        assert main(["export", str(sample), "--to", to, "--out", str(out)]) == 0
+        assert main(["import", str(out), "--out", str(back)]) == 0
+        with h5py.File(back) as file:
+            notes.append(json.loads(file["data"].attrs["env_args"]))
+    assert notes[0] == notes[1]
+    assert notes[0]["env_name"] == "Lift" and notes[0]["env_kwargs"]["robots"] == "xarm7"
+    assert setup_from(notes[0]["setup"]) is not None

@@ -1,7 +1,9 @@
-"""The same robot twice, for the contract tests: in lockstep in this process, and behind sockets in its own."""
+"""One robot three times, for the contract tests: the twin in lockstep in this process, the twin behind sockets in its
+own, and a real arm's driver there against the fake controller."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -10,6 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,16 +24,30 @@ from far_app.motion import TargetIntegrator
 from far_app.protocols import Heartbeat, Home, Reset, Resume, Robot
 from far_app.tasks import task
 from far_app.types import Ack, Observation, RobotMode, Target
+from hw.fake_xarm.control import FakeXArm
 from hw.lockstep import LockstepRobot
-from hw.rig import load_rig
+from hw.rig import RIGS, load_rig
 from hw.twin import TwinPlant
 from hw.twin_view import TwinView
 
 RIG, TASK = load_rig("twin"), task("lift")
+XARM = load_rig("xarm7")
+XARM = replace(XARM, home=replace(XARM.home, speed=0.25, rotation_speed=1.2))
+"""The shipped rig, in a hurry to get home."""
+FAKE_PORT = 15502
+_addresses = itertools.count(1)
+
+
+def loopback() -> str:
+    """A loopback address of this process's own: the fake controller's report ports are fixed."""
+    return f"127.{20 + os.getpid() // 250 % 200}.{1 + os.getpid() % 250}.{next(_addresses)}"
 
 
 class Bench:
     """A robot and the passing of policy ticks, on its own clock."""
+
+    rig = RIG
+    cameras = TASK.cameras
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
@@ -84,7 +101,7 @@ class Bench:
 
     def drive(self, action: np.ndarray, ticks: int) -> list[Observation]:
         """The same action for a while, as a policy would; the observation after each tick."""
-        integrator = TargetIntegrator(RIG.scale, self.observe().eef)
+        integrator = TargetIntegrator(self.rig.scale, self.observe().eef)
         observations = []
         for _ in range(ticks):
             observation = self.robot.observe()
@@ -131,6 +148,29 @@ class RemoteBench(Bench):
         return time.monotonic()
 
 
+class XArmBench(RemoteBench):
+    """The driver on the fake controller: no scene to reset, so a start is a way home."""
+
+    rig, cameras = XARM, ()
+
+    def __init__(self, robot: RemoteRobot, fake: FakeXArm) -> None:
+        super().__init__(robot)
+        self.fake = fake
+
+    def start(self, seed: int) -> Observation:
+        self.robot.request(Resume())
+        self.robot.request(Reset(seed=seed))
+        observation = self.go_home()
+        assert observation.status.at_home, observation.status
+        for _ in range(3):
+            self.tick()
+        self.observe()
+        self.acks.clear()
+        self.sent.clear()
+        self.fake.received()
+        return observation
+
+
 class HwProcess:
     """A real hw server in its own process."""
 
@@ -173,6 +213,32 @@ def remote() -> Iterator[RemoteBench]:
     assert server.close() == 0
 
 
-@pytest.fixture(params=["lockstep", "remote"])
+@pytest.fixture(scope="module")
+def fake() -> Iterator[FakeXArm]:
+    fake = FakeXArm.start(loopback(), FAKE_PORT)
+    yield fake
+    fake.close()
+
+
+@pytest.fixture(scope="module")
+def xarm(fake: FakeXArm, tmp_path_factory: pytest.TempPathFactory) -> Iterator[XArmBench]:
+    text = (RIGS / "xarm7.toml").read_text()
+    hurried = tmp_path_factory.mktemp("rig") / "hurried.toml"
+    hurried.write_text(text.replace("speed = 0.15\nrotation_speed = 0.8", "speed = 0.25\nrotation_speed = 1.2"))
+    server = HwProcess("--rig", str(hurried), "--address", f"{fake.address}:{FAKE_PORT}")
+    assert server.handshake.get("ready"), server.handshake
+    robot = RemoteRobot(server.endpoints)
+    yield XArmBench(robot, fake)
+    robot.close()
+    assert server.close() == 0
+
+
+@pytest.fixture(params=["lockstep", "remote", "xarm"])
 def bench(request: pytest.FixtureRequest) -> Bench:
+    return request.getfixturevalue(request.param)
+
+
+@pytest.fixture(params=["lockstep", "remote"])
+def twin_bench(request: pytest.FixtureRequest) -> Bench:
+    """What only a twin can promise: a scene that is put in place, and told of."""
     return request.getfixturevalue(request.param)

@@ -37,6 +37,7 @@ class KinematicPlant:
         self.breaks: Exception | None = None
         self.stuck = threading.Event()
         self.stuck.set()
+        self.halts = self.rearmed = 0
 
     def measure(self) -> Measured:
         return Measured(eef=self.pose, joints=np.zeros(7), gripper=1.0)
@@ -51,6 +52,14 @@ class KinematicPlant:
 
     def reset(self, seed: int) -> None:
         raise RobotError("an arm cannot reset the scene; the operator does")
+
+    def halt(self) -> None:
+        self.halts += 1
+
+    def rearm(self) -> None:
+        self.rearmed += 1
+
+    def close(self) -> None: ...
 
     def snapshot(self) -> Any:
         return self.pose
@@ -114,6 +123,7 @@ def test_stop_is_told_at_once_while_the_plant_hangs(servo: ServoThread, plant: K
     plant.stuck.clear()
     time.sleep(0.05)
     servo.stop("STOP")
+    assert plant.halts == 1, "the arm's own stop does not wait for the servo thread"
     with servo.locked() as controller:
         assert controller.status().mode is RobotMode.LATCHED
     plant.stuck.set()

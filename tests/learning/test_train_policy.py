@@ -11,6 +11,11 @@ from far_app.learning.dataset import Episode, check_origin, read_episodes, write
 from far_app.learning.policy import fingerprint, load_policy, preset
 from far_app.learning.segments import DemonstrationArrays
 from far_app.learning.train_policy import PolicyTraining, learning_rate, train_policy
+from hw.camera_config import CameraConfig
+from hw.camera_reader import CameraReader
+from hw.capture import Shot
+from hw.hardware_view import HardwareCamera
+from hw.synthetic_camera import SyntheticCapture
 
 CONFIG = dataclasses.replace(preset("quickstart", "lift"), image_size=16, widths=(16, 32, 64))
 TRAINING = PolicyTraining(iterations=6, batch=8, segment=4, draws=2, shift=2, save_every=3, log_every=2, localise=1.0)
@@ -120,3 +125,20 @@ def test_demonstrations_survive_the_disk(tmp_path):
         read_episodes(path, ("side",))
     with pytest.raises(RecordingError, match="far demo"):
         read_episodes(tmp_path / "none.hdf5", ("front",))
+
+
+def test_a_policy_sees_the_same_pixels_live_and_in_its_dataset(tmp_path):
+    """Whole frames in a dataset become pictures by the function that frames live ones; framed ones are left alone."""
+    config = CameraConfig(device="synthetic", width=512, height=144, eye="left", crop=(30, 4, 120, 120))
+    (framing,) = config.views("front").values()
+    frame = np.random.default_rng(3).integers(0, 256, (144, 512, 3), np.uint8)
+    reader = CameraReader("front", SyntheticCapture(config), config)
+    reader.newest = Shot(image=np.ascontiguousarray(frame[:, :, ::-1]), stamp=1.0)
+    live = HardwareCamera("front", 84, reader, framing).frame().image
+
+    (episode,) = episodes(1)
+    for name, picture in (("whole", frame), ("framed", live)):
+        there = dataclasses.replace(episode, images={"front": np.repeat(picture[None], len(episode), axis=0)})
+        write_episode(tmp_path / name, there, {"env_name": "Lift"})
+        (again,) = read_episodes(tmp_path / name, ("front",), size=84, framings={"front": framing})
+        assert all(np.array_equal(picture, live) for picture in again.images["front"]), name

@@ -140,6 +140,19 @@ def test_the_same_scene_and_attempt_teach_the_same_lesson():
     assert np.array_equal(plan(one), plan(two))
 
 
+def test_a_hedged_lesson_that_failed_is_withdrawn_for_one_attempt_and_remembered():
+    m = made("fcpa", RetryConfig(pairs=QUICK.pairs, fcpa=FCPAConfig(steps=2, lr=1e-3, accumulate=False, hedge=True)))
+    m.begin(5)
+    base = plan(m)
+    first, second, third = (adapt(m, small_attempt(index=i)) for i in (1, 2, 3))
+    assert [a.status for a in (first, second, third)] == ["adapted", "withdrawn", "adapted"]
+    assert [a.version for a in (first, second, third)] == ["base+a1", "base", "base+a2"]
+    assert second.flagged and not np.array_equal(plan(m), base)
+    assert sum(len(r) for r in m.rounds) == first.pairs + third.pairs
+    with pytest.raises(ConfigError, match=r"fcpa.accumulate is True, must be false when fcpa.hedge"):
+        FCPAConfig(hedge=True)
+
+
 def test_adaptations_accumulate_or_restart_with_all_pairs():
     def after(accumulate: bool, attempts: list[int]):
         config = RetryConfig(pairs=QUICK.pairs, fcpa=FCPAConfig(steps=2, lr=1e-3, accumulate=accumulate))

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from far_app.detectors import TwinCheck
+from far_app.detectors import PersonJudge, TwinCheck
 from far_app.errors import RecordingError
 from far_app.motion import ActionScale
 from far_app.protocols import Hold, Home, Resume
@@ -32,7 +32,8 @@ from tests.session.kinematic import Faster, Forward, KinematicRobot
 class Desk:
     """A session with everything a test may want to touch."""
 
-    def __init__(self, robot=None, policy=None, adapting_seconds=0.0, horizon=20, attempts=3, **settings) -> None:
+    def __init__(self, robot=None, policy=None, adapting_seconds=0.0, horizon=20, attempts=3, detector=None,
+                 **settings) -> None:  # fmt: skip
         self.robot = robot or KinematicRobot()
         self.method = Faster(policy or Forward(), adapting_seconds)
         self.inbox = IntentInbox()
@@ -40,7 +41,7 @@ class Desk:
         settings = {"name": "test", "trials": 1, "seed": 5, "headless": True} | settings
         self.session = Session(
             settings=SessionSettings(**settings), robot=self.robot, planner=ThreadedPlanner(), method=self.method,
-            detector=TwinCheck(2), scale=ActionScale(), recorder=Recorder(), inbox=self.inbox,
+            detector=detector or TwinCheck(2), scale=ActionScale(), recorder=Recorder(), inbox=self.inbox,
             task=replace(task("lift"), horizon=horizon, max_attempts=attempts, rate=50.0), statistics=self.statistics,
         )  # fmt: skip
 
@@ -270,3 +271,29 @@ def test_a_full_disk_ends_the_session_with_the_arm_held_and_what_was_recorded_re
         desk.session.run()
     assert isinstance(desk.robot.requests[-1], Hold)
     assert inspect_session(writer.folder).state == "failed"
+
+
+def test_a_person_judges_after_the_horizon_with_the_arm_held():
+    desk = Desk(policy=Forward(speed=0.1), horizon=10, attempts=1, detector=PersonJudge(20.0), headless=False)
+    desk.when(lambda: "success or failure?" in desk.session.board.reason,
+              lambda: desk.inbox.put(Intent.MARK_SUCCESS))  # fmt: skip
+    (result,) = desk.session.run()
+    assert (result.success, result.judged_by) == (True, "operator")
+    assert any(isinstance(r, Hold) and "waiting for the operator" in r.reason for r in desk.robot.requests)
+    assert len(desk.session._attempts[0].steps) == 10, "judging uses none of the horizon's ticks"
+
+
+def test_a_person_who_says_nothing_within_the_time_means_failure():
+    desk = Desk(policy=Forward(speed=0.1), horizon=10, attempts=2, detector=PersonJudge(0.3), headless=False)
+    began = time.monotonic()
+    (result,) = desk.session.run()
+    assert (result.success, result.judged_by, result.attempts) == (False, "horizon", 2)
+    assert time.monotonic() - began > 0.6
+
+
+def test_stop_while_a_person_is_asked_ends_the_attempt():
+    desk = Desk(policy=Forward(speed=0.1), horizon=10, attempts=1, detector=PersonJudge(20.0), headless=False)
+    desk.when(lambda: "success or failure?" in desk.session.board.reason, lambda: desk.inbox.put(Intent.STOP))
+    desk.when(lambda: desk.state is State.STOPPED, lambda: desk.inbox.put(Intent.RESUME))
+    (result,) = desk.session.run()
+    assert (result.success, result.judged_by) == (False, "operator")

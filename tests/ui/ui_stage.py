@@ -26,6 +26,7 @@ from far_app.telemetry import (
     LogLine,
     LoopHealth,
     OperatorIntent,
+    PagePresence,
     SceneGeometry,
     StopAck,
     StopRequest,
@@ -113,6 +114,7 @@ class Stage:
         """Let the attempt's tick go on by itself."""
         self.mode = RobotMode.TRACKING
         self.intents: list[OperatorIntent] = []
+        self.present: list[PagePresence] = []
         self.stops: list[StopRequest] = []
         self.stop_answers = True
         self._bodies = bodies
@@ -163,7 +165,11 @@ class Stage:
 
     def _answer(self) -> None:
         while self._pull.poll(0):
-            self.intents.append(unpack(self._pull.recv()))
+            message = unpack(self._pull.recv())
+            if isinstance(message, OperatorIntent):
+                self.intents.append(message)
+            else:
+                self.present.append(message)
         if self._geometry.poll(0):
             assert isinstance(unpack(self._geometry.recv()), GeometryRequest)
             vertices, faces = cube(0.08)

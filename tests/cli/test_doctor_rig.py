@@ -1,0 +1,64 @@
+"""`far doctor --rig`: what a rig file says, and what differs at the controller; it changes nothing there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from far_app.cli import main
+from hw.fake_xarm.__main__ import main as fake_xarm
+from hw.fake_xarm.control import FakeXArm
+from hw.fake_xarm.protocol import Function
+from hw.rig import RIGS
+from tests.hw.conftest import FAKE_PORT, loopback
+
+
+@pytest.fixture
+def fake() -> Iterator[FakeXArm]:
+    fake = FakeXArm.start(loopback(), FAKE_PORT)
+    yield fake
+    fake.close()
+
+
+def doctor(fake: FakeXArm, rig: str = "xarm7") -> int:
+    return main(["doctor", "--rig", rig, "--host", f"{fake.address}:{FAKE_PORT}"])
+
+
+def test_a_rig_that_fits_its_controller_is_well_and_nothing_is_written(fake: FakeXArm, capsys) -> None:
+    assert doctor(fake) == 0
+    out = capsys.readouterr().out
+    assert "BAD" not in out
+    for subject in ("start pose", "tool", "load", "collision", "network", "reports", "gripper"):
+        assert f"ok   {subject}" in out
+    assert {r["function"] for r in fake.received()} <= {Function.GET_VERSION, Function.GET_ROBOT_SN}
+
+
+def test_what_differs_is_told_with_both_values(fake: FakeXArm, tmp_path: Path, capsys) -> None:
+    fake.tell(do="set", name="sensitivity", value=1)
+    fake.error(35)
+    rig = tmp_path / "mine.toml"
+    rig.write_text(
+        (RIGS / "xarm7.toml").read_text().replace("0.172", "0.150").replace("load_mass = 0.82", "load_mass = 1.5")
+    )
+    assert doctor(fake, str(rig)) == 1
+    out = capsys.readouterr().out
+    assert "BAD  errors     C35: Safety Boundary Limit" in out
+    assert "BAD  tool       rig (0, 0, 150, 0, 0, 0) (mm, rad), controller (0, 0, 172, 0, 0, 0)" in out
+    assert "BAD  load       rig 1.5 kg" in out and "controller 0.82 kg" in out
+    assert "BAD  collision  sensitivity 1, the rig asks for at least 3" in out
+    assert fake.state()["error"] == 35, "a doctor clears nothing"
+
+
+def test_no_controller_is_one_line(capsys) -> None:
+    assert main(["doctor", "--rig", "xarm7", "--host", f"{loopback()}:{FAKE_PORT}"]) == 1
+    assert "BAD  controller no xArm controller at" in capsys.readouterr().out
+
+
+def test_a_running_fake_is_told_from_the_command_line(fake: FakeXArm, capsys) -> None:
+    assert fake_xarm(["--address", fake.address, "tell", "error", "31"]) == 0
+    assert fake.state()["error"] == 31
+    assert fake_xarm(["--address", fake.address, "tell", "faults", "latency=0.01"]) == 0
+    with pytest.raises(Exception, match="unknown fault 'speed'"):
+        fake_xarm(["--address", fake.address, "tell", "faults", "speed=1"])
