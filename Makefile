@@ -1,13 +1,14 @@
 # make run      set up what is missing, then start the application:  make run ARGS="--trials 1 --headless"
 # make test     set up what is missing, then run all tests
 # make lint     ruff and pyright
+# make test-interop   do LeRobot's and robomimic's own loaders read our exports? in an environment of its own
 # Set-up needs the network once; it is skipped while its inputs are unchanged (stamps in .venv).
 
 VENV := .venv
 INPUTS := pyproject.toml constraints.txt scripts/set-up
 export PYTHONUNBUFFERED := 1
 
-.PHONY: run test lint
+.PHONY: run test lint test-interop
 
 run: $(VENV)/.ready-run
 	@$(VENV)/bin/far run $(ARGS)
@@ -19,6 +20,9 @@ lint: $(VENV)/.ready-test
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/pyright
+
+test-interop: $(VENV)/.ready-run
+	@scripts/test-interop
 
 $(VENV)/.ready-run: $(INPUTS)
 	@PYTHON="$(PYTHON)" scripts/set-up run

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from far_app.types import ActionChunk, Adaptation, AdaptationStep, Attempt, Observation, Outcome, Target
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Observation, Outcome, Target
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,6 +194,16 @@ class Method(Protocol):
 
     def perturb(self, attempt_index: int, scene_seed: int) -> Callable[[int], Float[np.ndarray, "A"]]:
         """δ by tick for one attempt (zeros on the first)."""
+        ...
+
+
+@runtime_checkable
+class KeepsWeights(Protocol):
+    """A method whose adaptations make weights that are worth keeping."""
+
+    @property
+    def adapted(self) -> AdaptedWeights | None:
+        """Those of the version that acts now; None while that is the base policy."""
         ...
 
 

@@ -233,6 +233,19 @@ class Adaptation:
 
 
 @dataclass(frozen=True, kw_only=True)
+class AdaptedWeights:
+    """The weights an adaptation made, for the recording."""
+
+    version: str
+    parent: str
+    """The version it was made from."""
+    base: str
+    """Fingerprint of the base policy: encoder and normaliser are its own."""
+    tensors: Mapping[str, np.ndarray]
+    """The denoiser's, by name; never written to again."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Trial:
     """All attempts on one scene."""
 

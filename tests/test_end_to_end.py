@@ -12,6 +12,7 @@ import pytest
 
 from far_app.recording.inspect import find_session, inspect_session
 from far_app.recording.reader import read_session
+from far_app.recording.weights_file import weights_path
 
 FAR = Path(sys.executable).parent / "far"
 
@@ -47,5 +48,6 @@ def test_a_trial_fails_learns_and_retries_with_no_button_pressed(tmp_path):
             assert attempt.flagged > 0
             if attempt.adaptation == "adapted":
                 assert retry.policy_version != attempt.policy_version
+                assert weights_path(session / attempt.file).exists(), "what it learnt is kept"
     for file in read_session(session).files:
         assert file.with_suffix(".rrd").exists(), "each attempt also becomes one .rrd"

@@ -1,4 +1,4 @@
-"""`far report`: what a folder of results says, as Markdown and a picture."""
+"""`far report`: what a folder of results says (Markdown and a picture), or recorded sessions (one HTML page)."""
 
 from __future__ import annotations
 
@@ -8,23 +8,56 @@ from pathlib import Path
 
 import tyro
 
+from far_app.errors import ConfigError
 from far_app.report import markdown, read_folder
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportOptions:
-    """Tables with intervals and tests (README.md), and success by attempt (success.png)."""
+    """Of results: tables with intervals and tests (README.md), and success by attempt (success.png). Of recorded
+    sessions: a page with both, and every failure with its flagged moment."""
 
-    results: tyro.conf.Positional[Path]
-    """A folder that `far eval` or `far study` wrote."""
+    folders: tyro.conf.Positional[tuple[Path, ...]]
+    """A folder that `far eval` or `far study` wrote, or recorded sessions."""
     out: Path | None = None
-    """Where to write; the folder itself by default."""
+    """Of results: the folder to write to, by default their own. Of sessions: the page, by default
+    report_SESSION.html here."""
+    overwrite: bool = False
+    """Replace a page that exists."""
 
 
 def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(ReportOptions, args=list(arguments), prog="far report")
-    print(write_report(options.results, options.out or options.results))
+    folders = list(options.folders)
+    if not folders:
+        raise ConfigError("nothing to report on; give a folder of far eval's results, or recorded sessions")
+    if any(results_in(folder) for folder in folders):
+        if len(folders) > 1:
+            raise ConfigError("one folder of results at a time; several recorded sessions can share a page")
+        print(write_report(folders[0], options.out or folders[0]))
+    else:
+        print(write_page(folders, options.out, options.overwrite))
     return 0
+
+
+def results_in(folder: Path) -> bool:
+    """Whether `far eval` or `far study` wrote it."""
+    if (folder / "session.json").exists():
+        return False
+    return (folder / "plan.json").exists() or any(folder.glob("*/plan.json"))
+
+
+def write_page(folders: Sequence[Path], out: Path | None, overwrite: bool) -> Path:
+    """Where the page of these sessions is."""
+    from far_app.exchange.target import whole
+    from far_app.recording.inspect import find_session
+    from far_app.session_report.page import page
+
+    sessions = list(dict.fromkeys(find_session(folder) for folder in folders))
+    target = out or Path(f"report_{sessions[0].resolve().name}.html")
+    with whole(target, overwrite) as half:
+        half.write_text(page(sessions), encoding="utf-8")
+    return target
 
 
 def write_report(folder: Path, target: Path) -> str:

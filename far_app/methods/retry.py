@@ -23,7 +23,7 @@ from far_app.learning import diffusion, fcpa
 from far_app.learning.cancellation import AdaptationCancelledError, Cancelled, check
 from far_app.learning.critic import Critic
 from far_app.learning.pairs import Pairs, candidates, explored, merged, select, weighted_trajectory
-from far_app.learning.policy import DiffusionPolicy
+from far_app.learning.policy import DiffusionPolicy, fingerprint
 from far_app.learning.preference import Demonstrations, Noising
 from far_app.learning.steering import Steering
 from far_app.learning.trainable import trainable
@@ -32,7 +32,7 @@ from far_app.methods.evidence import sent_chunks
 from far_app.perturbation import Perturbation, perturbation
 from far_app.protocols import Policy, Progress
 from far_app.seeding import generator
-from far_app.types import Adaptation, AdaptationStep, Attempt
+from far_app.types import Adaptation, AdaptationStep, AdaptedWeights, Attempt
 
 
 class Act(Protocol):
@@ -74,6 +74,9 @@ class RetryMethod:
             fcpa.check_config(self.config.fcpa, self.demonstrations)
             if self.critic is None:
                 raise ConfigError(f"method '{name}' needs a critic; train one with `far train critic`, or use nr")
+        self.adapted: AdaptedWeights | None = None
+        """far_app.protocols.KeepsWeights."""
+        self._fingerprint = ""
         self._act = ingredients.act
         self._swap = threading.Lock()
         self._base_policy = self._act(self.base, BASE_VERSION)
@@ -116,6 +119,7 @@ class RetryMethod:
         self._trial += 1
         self.acting = self.base
         self.policy = self._base_policy
+        self.adapted = None
         self.rounds: list[Pairs] = []
         self._adaptations = 0
 
@@ -129,11 +133,17 @@ class RetryMethod:
         """Swap the acting policy, unless a new trial began or nobody waits any more."""
         network = with_denoiser(self.base, denoiser)
         policy = self._act(network, f"{BASE_VERSION}+a{self._adaptations + 1}")
+        self._fingerprint = self._fingerprint or fingerprint(self.base)
+        parent = self.policy if self.config.fcpa.accumulate else self._base_policy
+        weights = AdaptedWeights(
+            version=policy.version, parent=parent.version, base=self._fingerprint,
+            tensors={name: tensor.cpu().numpy() for name, tensor in denoiser.state_dict().items()},
+        )  # fmt: skip
         with self._swap:
             check(outdated)
             self._adaptations += 1
             self.rounds.append(pairs)
-            self.acting, self.policy = network, policy
+            self.acting, self.policy, self.adapted = network, policy, weights
 
 
 def with_denoiser(network: DiffusionPolicy, denoiser: nn.Module) -> DiffusionPolicy:

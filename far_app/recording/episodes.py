@@ -10,11 +10,12 @@ import numpy as np
 from far_app.errors import ConfigError, RecordingError
 from far_app.learning.dataset import Episode, episode_of, seen_and_done
 from far_app.recording.reader import read_session
+from far_app.types import Attempt, Outcome
 
 
 def session_episodes(path: Path, task: str) -> list[Episode]:
-    """Successes and failures of a session, in order; an attempt that was abandoned or cut off is left out. A success
-    that only a person saw counts from its last tick. Raises ConfigError for a session of another task."""
+    """Successes and failures of a session, in order; an attempt that was abandoned or cut off is left out. Raises
+    ConfigError for a session of another task."""
     session = read_session(path)
     if session.header.info.task != task:
         raise ConfigError(f"{path} is a session of task '{session.header.info.task}', these models are for '{task}'")
@@ -27,9 +28,14 @@ def session_episodes(path: Path, task: str) -> list[Episode]:
         if not attempt.steps or recording.header is None:
             continue
         outcome = session.marks.get((recording.header.trial, recording.header.attempt), attempt.outcome)
-        episode = episode_of(*seen_and_done(attempt), outcome.success, attempt.scene_seed)
-        completed = episode.successes & outcome.success
-        if outcome.success and not completed.any():
-            completed = np.arange(len(episode)) == len(episode) - 1
-        episodes.append(replace(episode, successes=completed))
+        episodes.append(judged_episode(attempt, outcome))
     return episodes
+
+
+def judged_episode(attempt: Attempt, outcome: Outcome) -> Episode:
+    """An attempt under the last word on it. A success that only a person saw counts from its last tick."""
+    episode = episode_of(*seen_and_done(attempt), outcome.success, attempt.scene_seed)
+    completed = episode.successes & outcome.success
+    if outcome.success and not completed.any():
+        completed = np.arange(len(episode)) == len(episode) - 1
+    return replace(episode, successes=completed)

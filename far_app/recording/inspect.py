@@ -218,7 +218,9 @@ def _compare(report: AttemptReport, trial: int, events: dict[tuple[str, int, int
 def _missing_files(session: SessionRecording) -> list[str]:
     there = {str(file.relative_to(session.path)) for file in session.files}
     known = [attempt_name(entry.trial, entry.attempt) for entry in session.log if entry.event == "attempt_started"]
-    return [f"{name} is missing" for name in known if name not in there]
+    weights = [str(entry.detail.get("file")) for entry in session.log if entry.event == "weights_kept"]
+    there |= {name for name in weights if (session.path / name).exists()}
+    return [f"{name} is missing" for name in (*known, *weights) if name not in there]
 
 
 def _events(session: SessionRecording) -> dict[tuple[str, int, int], LogEntry]:

@@ -194,6 +194,7 @@ LINES = {
     "attempt_ended": "`detail.success`, `detail.judged_by`, `detail.note`, `detail.steps`; its steps are on the disk",
     "attempt_abandoned": "the attempt ended without an outcome; `text` says why, `detail.steps`",
     "adapted": "`detail.status`, `detail.base_version`, `detail.version`, `detail.flagged`, `detail.pairs`",
+    "weights_kept": "`detail.file`, `detail.version`, `detail.parent`, `detail.bytes`: what the adaptation made",
     "outcome_marked": "someone's word on an attempt: `detail.success`, `detail.judged_by`, `detail.note`",
     "trial_ended": "`detail.success`, `detail.attempts`",
     "recording_failed": "the writer gave up; `text` says why",

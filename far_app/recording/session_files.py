@@ -23,7 +23,8 @@ from far_app.recording.session_folder import (
     make_session,
     trial_folder,
 )
-from far_app.types import ActionChunk, Adaptation, AdaptationStep, Attempt, Outcome, Step
+from far_app.recording.weights_file import weights_path, write_weights
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step
 
 _SPACE_CHECK_INTERVAL = 5.0
 _LATE = 1.0
@@ -109,6 +110,17 @@ class SessionFiles:
             "adapted", stamp=stamp, trial=file.header.trial, attempt=file.header.attempt, text=adaptation.note,
             detail={"status": adaptation.status, "base_version": adaptation.base_version,
                     "version": adaptation.version, "flagged": len(adaptation.flagged), "pairs": adaptation.pairs},
+        )  # fmt: skip
+
+    def weights(self, stamp: float, weights: AdaptedWeights, adaptation: Adaptation) -> None:
+        file = self._open
+        path = weights_path(file.path)
+        size = write_weights(path, weights, adaptation, file.header)
+        self._unsynced.append(path)
+        self._trials.append(
+            "weights_kept", stamp=stamp, trial=file.header.trial, attempt=file.header.attempt,
+            detail={"file": str(path.relative_to(self.folder)), "version": weights.version, "parent": weights.parent,
+                    "bytes": size},
         )  # fmt: skip
 
     def mark(self, stamp: float, outcome: Outcome, trial: int, attempt: int) -> None:

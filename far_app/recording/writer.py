@@ -26,7 +26,7 @@ from far_app.errors import RecordingError
 from far_app.recording.schema import SCHEMA_VERSION, AttemptHeader, SessionInfo, json_schemas
 from far_app.recording.session_files import SessionFiles
 from far_app.recording.session_folder import SPACE_TO_GO_ON, SPACE_TO_START, attempt_name
-from far_app.types import ActionChunk, Adaptation, AdaptationStep, Attempt, Outcome, Step
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step
 
 log = logging.getLogger(__name__)
 
@@ -145,6 +145,11 @@ class SessionWriter:
         """What the last attempt's failure taught."""
         assert self._attempt > 0, "an adaptation needs the attempt it learns from: its trial has ended"
         self._put(self._files.adaptation, adaptation)
+
+    def add_weights(self, weights: AdaptedWeights, adaptation: Adaptation) -> None:
+        """What the adaptation made, to a file beside its attempt's; the arrays are not copied and must not change."""
+        assert self._attempt > 0, "weights need the attempt they were learnt from: its trial has ended"
+        self._put(self._files.weights, weights, adaptation)
 
     def mark(self, outcome: Outcome, *, trial: int = 0, attempt: int = 0) -> None:
         """Someone's word on an attempt that has ended (the newest by default), beside the program's own judgment."""

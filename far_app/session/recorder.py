@@ -8,7 +8,7 @@ from typing import Any
 
 from far_app.errors import RecordingError
 from far_app.recording.writer import SessionWriter
-from far_app.types import ActionChunk, Adaptation, AdaptationStep, Attempt, Outcome, Step
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step
 
 
 class Recorder:
@@ -46,6 +46,9 @@ class Recorder:
 
     def add_adaptation(self, adaptation: Adaptation) -> None:
         self._hand(lambda w: w.add_adaptation(adaptation))
+
+    def add_weights(self, weights: AdaptedWeights, adaptation: Adaptation) -> None:
+        self._hand(lambda w: w.add_weights(weights, adaptation))
 
     def mark(self, outcome: Outcome) -> None:
         self._hand(lambda w: w.mark(outcome))

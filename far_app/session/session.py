@@ -18,7 +18,7 @@ from far_app.config import TaskConfig
 from far_app.detectors import OperatorOverride
 from far_app.errors import RobotError
 from far_app.motion import ActionScale
-from far_app.protocols import Hold, Method, PlanRequest, Robot, SuccessDetector
+from far_app.protocols import Hold, KeepsWeights, Method, PlanRequest, Robot, SuccessDetector
 from far_app.scheduling import LOOP_PRIORITY, real_time_inside
 from far_app.session.adaptation import BackgroundAdaptation, unchanged
 from far_app.session.board import Board
@@ -339,6 +339,9 @@ class Session:
         self._adaptations.append(adaptation)
         self.board.adapted(adaptation)
         self.recorder.add_adaptation(adaptation)
+        weights = self.method.adapted if isinstance(self.method, KeepsWeights) else None
+        if weights is not None and weights.version == adaptation.version != adaptation.base_version:
+            self.recorder.add_weights(weights, adaptation)
         note = f" ({adaptation.note})" if adaptation.note else ""
         self.supervision.say(f"adaptation: {adaptation.status}, {adaptation.pairs} pairs → {adaptation.version}{note}")
 

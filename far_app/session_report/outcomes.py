@@ -1,0 +1,167 @@
+"""Trials of recorded sessions as they ended, and what they say: success by attempt, paired differences. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from far_app.recording.reader import SessionRecording
+from far_app.statistics import mcnemar, paired_difference, wilson
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compared:
+    """What distinguishes one way of trying from another."""
+
+    task: str
+    method: str
+    policy: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialOutcome:
+    """A trial that ended: solved, or out of attempts."""
+
+    session: str
+    trial: int
+    scene: int
+    solved_by: int | None
+    """The attempt that succeeded; None when none did."""
+    attempts: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Group:
+    """Trials of one way of trying."""
+
+    what: Compared
+    max_attempts: int
+    trials: tuple[TrialOutcome, ...]
+    unfinished: int
+    """Trials that were skipped, cut off, begun at reduced speed or not yet over: in no figure."""
+
+    def solved(self, attempts: int) -> list[bool]:
+        return [t.solved_by is not None and t.solved_by <= attempts for t in self.trials]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rate:
+    solved: int
+    trials: int
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 %, Wilson."""
+        return wilson(self.solved, self.trials)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference:
+    """Left − right over the same scenes, points in [−1, 1]."""
+
+    left: str
+    right: str
+    scenes: int
+    mean: float
+    low: float
+    high: float
+    only_left: int
+    only_right: int
+    p: float
+    """Exact McNemar, two-sided."""
+
+
+def groups(sessions: Sequence[SessionRecording]) -> list[Group]:
+    """By what was compared, in order of appearance."""
+    found: dict[Compared, list[TrialOutcome]] = {}
+    unfinished: dict[Compared, int] = {}
+    limits: dict[Compared, int] = {}
+    for session in sessions:
+        info = session.header.info
+        what = Compared(task=info.task, method=info.method, policy=info.policy)
+        ended, left = ended_trials(session)
+        found.setdefault(what, []).extend(ended)
+        unfinished[what] = unfinished.get(what, 0) + left
+        limits[what] = max(limits.get(what, 1), allowed(session) or 1, *(t.attempts for t in ended), 1)
+    return [
+        Group(what=what, max_attempts=limits[what], trials=tuple(trials), unfinished=unfinished[what])
+        for what, trials in found.items()
+    ]
+
+
+def ended_trials(session: SessionRecording) -> tuple[list[TrialOutcome], int]:
+    """Trials that ended by themselves, under the last word on each attempt, and how many did not."""
+    scenes = {e.trial: int(e.detail.get("scene_seed", 0)) for e in session.log if e.event == "trial_started"}
+    slow = {e.trial for e in session.log if e.event == "reduced_speed"}
+    over = {e.trial for e in session.log if e.event == "trial_ended"} - slow
+    limit, ended = allowed(session), []
+    for trial in sorted(over & set(scenes)):
+        said = {attempt: o.success for (t, attempt), o in sorted(session.marks.items()) if t == trial}
+        solved_by = next((attempt for attempt, success in said.items() if success), None)
+        if solved_by is not None or (said and len(said) >= (limit or 1)):
+            ended.append(TrialOutcome(
+                session=session.header.session, trial=trial, scene=scenes[trial], solved_by=solved_by,
+                attempts=solved_by or len(said),
+            ))  # fmt: skip
+    return ended, len(scenes) - len(ended)
+
+
+def allowed(session: SessionRecording) -> int | None:
+    """Attempts a trial may have; None when the recording does not say."""
+    config: Mapping[str, Mapping[str, object]] = session.header.info.config
+    known = config.get("task", {}).get("max_attempts")
+    return int(known) if isinstance(known, int) else None
+
+
+def labels(found: Sequence[Group]) -> list[str]:
+    """Short names that still tell the groups apart."""
+    varying = [field for field in ("task", "policy") if len({getattr(g.what, field) for g in found}) > 1]
+    return [" · ".join([g.what.method, *(str(getattr(g.what, field)) for field in varying)]) for g in found]
+
+
+def by_attempt(group: Group) -> list[Rate]:
+    """Success within 1, 2, … attempts."""
+    counts = [group.solved(k) for k in range(1, group.max_attempts + 1)]
+    return [Rate(solved=sum(solved), trials=len(solved)) for solved in counts]
+
+
+def differences(found: Sequence[Group]) -> list[Difference]:
+    """Each pair of groups on the scenes they share (the k-th trial of a scene beside the k-th), then what retrying
+    gains over the first attempt."""
+    names, out = labels(found), []
+    for i, left in enumerate(found):
+        for j, right in enumerate(found[:i]):
+            if left.what.task == right.what.task:
+                attempts = min(left.max_attempts, right.max_attempts)
+                pairs = shared(left, right, attempts)
+                if pairs:
+                    out.append(_difference(names[i], names[j], pairs))
+    for name, group in zip(names, found, strict=True):
+        if group.max_attempts > 1 and group.trials:
+            pairs = list(zip(group.solved(group.max_attempts), group.solved(1), strict=True))
+            out.append(_difference(name, f"{name}, first attempt", pairs))
+    return out
+
+
+def shared(left: Group, right: Group, attempts: int) -> list[tuple[bool, bool]]:
+    """Solved within so many attempts, by scene and repetition."""
+
+    def numbered(group: Group) -> dict[tuple[int, int], bool]:
+        seen: dict[int, int] = {}
+        out = {}
+        for trial, solved in zip(group.trials, group.solved(attempts), strict=True):
+            seen[trial.scene] = seen.get(trial.scene, 0) + 1
+            out[trial.scene, seen[trial.scene]] = solved
+        return out
+
+    ours, theirs = numbered(left), numbered(right)
+    return [(ours[key], theirs[key]) for key in sorted(ours.keys() & theirs.keys())]
+
+
+def _difference(left: str, right: str, pairs: Sequence[tuple[bool, bool]]) -> Difference:
+    mean, low, high = paired_difference([a for a, _ in pairs], [b for _, b in pairs])
+    only_left, only_right = sum(a and not b for a, b in pairs), sum(b and not a for a, b in pairs)
+    return Difference(
+        left=left, right=right, scenes=len(pairs), mean=mean, low=max(-1.0, low), high=min(1.0, high),
+        only_left=only_left, only_right=only_right, p=mcnemar(only_left, only_right),
+    )  # fmt: skip
