@@ -77,7 +77,7 @@ class Page:
         if listener is not None and listener.native_id is not None:
             hasten(listener.native_id)  # the thread that hears STOP
         self._feeds = Feeds(endpoints)
-        self._stop_line = StopLine(endpoints.stop)
+        self._stop_line = StopLine(endpoints)
         self._console = Console(self._server, self._stop_line, self._latest, scene3d=options.scene3d)
         self._viewer = LiveViewer(options.run_folder, options.recordings) if options.rerun else None
         self._plots, self._texts, self._trails, self._beats = Every(1 / 5), Every(1 / 5), Every(1 / 5), Every(1 / 2)

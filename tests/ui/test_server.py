@@ -174,7 +174,7 @@ def gone(pid: int) -> bool:
 
 def test_the_stop_line_gives_up_and_works_again(folder: Path) -> None:
     """A REQ that timed out is never reused: the next press works once the hw server is there."""
-    line = StopLine(Endpoints.in_folder(folder).stop)
+    line = StopLine(Endpoints.in_folder(folder))
     line.press("test")
     assert wait_until(lambda: line.result is not None and line.result.latched is False)
     stage = Stage(folder)
@@ -188,7 +188,7 @@ def test_the_stop_line_gives_up_and_works_again(folder: Path) -> None:
 def test_a_press_does_not_wait_for_the_hw_server(folder: Path) -> None:
     stage = Stage(folder)
     stage.stop_answers = False
-    line = StopLine(Endpoints.in_folder(folder).stop)
+    line = StopLine(Endpoints.in_folder(folder))
     line.press("test")
     assert line.result is None or line.result.latched is None
     assert wait_until(lambda: len(stage.stops) == 1)
