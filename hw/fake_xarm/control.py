@@ -50,6 +50,11 @@ class FakeXArm:
         fake._process = process
         return fake
 
+    @property
+    def pid(self) -> int | None:
+        """Of its process, when `start` made it."""
+        return self._process.pid if self._process is not None else None
+
     def tell(self, **words: Any) -> dict[str, Any]:
         """One request; the answer. Raises RobotError where the fake does not understand."""
         self._file.write(json.dumps(words) + "\n")
