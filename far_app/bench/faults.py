@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 
 from far_app.bench.fault_table import FAULTS, Bench, Fault, hasten
-from far_app.bench.report import write
+from far_app.bench.report import keep, write
 from far_app.bench.servo_trace import servo_trace
 from far_app.bench.whole_runs import WHOLE_RUNS, whole_runs
 from far_app.cli.options import RunOptions
@@ -68,6 +68,7 @@ def main(arguments: Sequence[str]) -> int:
     for name in (n for n in names if n in WHOLE_RUNS):
         row_ = whole_runs(name, options.whole_runs or options.repeats, options.address, options.policy)
         report.setdefault("faults", {})[name] = row_
+        keep(report, options.json)
     write(report, options.json)
     return 0
 
@@ -75,7 +76,10 @@ def main(arguments: Sequence[str]) -> int:
 def measure(options: FaultOptions, names: list[str]) -> dict[str, Any]:
     """All faults in one session."""
     with tempfile.TemporaryDirectory(prefix="far-bench-") as recordings, running(options, Path(recordings)) as bench:
-        rows = {name: row([once(bench, FAULTS[name]) for _ in range(options.repeats)]) for name in names}
+        rows: dict[str, Any] = {}
+        for name in names:
+            rows[name] = row([once(bench, FAULTS[name]) for _ in range(options.repeats)])
+            keep({"repeats": options.repeats, "faults": rows}, options.json)
         bench.inbox.put(Intent.QUIT)
         bench.wait(lambda: bench.state is State.FINISHED, 10.0)
         time.sleep(1.0)

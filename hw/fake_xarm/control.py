@@ -77,7 +77,7 @@ class FakeXArm:
         self.tell(do="faults", set=values, stall_in=stall_in)
 
     def received(self) -> list[dict[str, Any]]:
-        """What came in since last asked (hw.fake_xarm.controller.Received as dicts)."""
+        """What came in since last asked (hw.fake_xarm.received.Received as dicts)."""
         return self.tell(do="received")["received"]
 
     def servo_targets(self) -> list[dict[str, Any]]:
