@@ -2,7 +2,8 @@
 
 A thread reads every observation, keeps the newest and gathers the acknowledgments of all, so that a busy app misses
 pictures but never an acknowledgment. Targets and requests go out on sockets of their own: a request that waits for its
-reply never holds up a target.
+reply never holds up a target. Times that come in or go out are translated here, and only here, where the hw server is
+on another machine (far_app/station.py).
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ from dataclasses import replace
 
 import zmq
 
-from far_app.endpoints import Endpoints, Reply
+from far_app.endpoints import Call, Endpoints, Reply
 from far_app.errors import RobotError
 from far_app.protocols import Heartbeat, Hold, Request, Reset, Resume
 from far_app.scheduling import prompt_context
+from far_app.station import LIMIT, ClockThread, RobotClock
 from far_app.types import Ack, Observation, Target
 from far_app.wire import WireError, pack, unpack
 
@@ -32,6 +34,10 @@ RESUME_TIMEOUT = 40.0
 """A real arm is connected anew, cleared and enabled by it."""
 LAST_CHANCE = 0.1
 """Seconds given to this process's own reading thread, which may have been starved too, before the robot is lost."""
+HEARTBEAT_LIFE = 0.1
+"""Seconds after which a heartbeat tells nothing any more: as long as a target is good for."""
+WHAT_TO_DO = "see the hw server's log, then start again", "look at the cable and that machine, then press Resume"
+"""About a silent hw server of ours, and one on another machine."""
 POLL = 0.1
 """Seconds between looks at whether the link was closed."""
 
@@ -42,7 +48,10 @@ class RemoteRobot:
     def __init__(self, endpoints: Endpoints, connect_timeout: float = 30.0) -> None:
         """Waits for the first observation; raises RobotError when none comes within connect_timeout seconds."""
         self._context = prompt_context()
+        endpoints.secure(self._context)
         self.endpoints = endpoints
+        self.clock = RobotClock()
+        self._clock_thread: ClockThread | None = None
         self._targets = self._dealer(send_limit=16)
         self._requests = self._dealer(send_limit=16)
         self._targets_lock, self._requests_lock = threading.Lock(), threading.Lock()
@@ -60,16 +69,38 @@ class RemoteRobot:
         self.damaged = 0
         """Messages that could not be read."""
         self._thread = threading.Thread(target=self._receive, name="observations", daemon=True)
-        self._thread.start()
-        with self._news:
-            if not self._news.wait_for(lambda: self._newest is not None, connect_timeout):
-                self._closed = True
-        if self._closed:
-            self._thread.join()
-            self._context.destroy(linger=0)
+        try:
+            if endpoints.elsewhere:
+                self._clock_thread = ClockThread(self._context, endpoints.station, self.clock)
+                self._compare_clocks(connect_timeout)
+            self._thread.start()
+            with self._news:
+                if not self._news.wait_for(lambda: self._newest is not None, connect_timeout):
+                    raise RobotError(
+                        f"no observation from the hw server at {endpoints.observations} within "
+                        f"{connect_timeout:.0f} s; see its own log for why"
+                    )
+        except RobotError:
+            self._let_go()
+            raise
+
+    def _compare_clocks(self, patience: float) -> None:
+        assert self._clock_thread is not None, "two machines have a clock thread"
+        if not self._clock_thread.known.wait(patience):
             raise RobotError(
-                f"no observation from the hw server at {endpoints.observations} within {connect_timeout:.0f} s; "
-                "see its own log for why"
+                f"the clock of the hw server at {self.endpoints.station} did not answer within {patience:.0f} s; is it "
+                "running, and is the link up?"
+            )
+        self._check_clock()
+
+    def _check_clock(self) -> None:
+        """Targets expire by the hw server's clock: it must be known well enough."""
+        bound = self.clock.bound()
+        if bound > LIMIT:
+            raise RobotError(
+                f"the hw server's clock is known to ±{1e3 * bound:.0f} ms only (limit {1e3 * LIMIT:.0f} ms, best round "
+                f"trip {1e3 * self.clock.round_trip:.0f} ms): the link is too slow or was silent for long; use a cable "
+                "of its own"
             )
 
     def _dealer(self, send_limit: int) -> zmq.Socket[bytes]:
@@ -106,7 +137,7 @@ class RemoteRobot:
         with self._news:
             if self._newest is not None:
                 self.drops += max(0, observation.seq - self._newest.seq - 1)
-            self._newest = observation
+            self._newest = observation = self.clock.ours(observation)
             self._acks.extend(observation.acks)
             self._heard = time.monotonic()
             self._news.notify_all()
@@ -121,8 +152,9 @@ class RemoteRobot:
             if self._closed or newest is None or silence > SILENCE:
                 raise RobotError(
                     f"no observation from the hw server for {silence:.1f} s (limit {SILENCE} s): it died, hangs or "
-                    "was cut off; the arm holds by its watchdog; see the hw server's log, then start again"
+                    f"was cut off; the arm holds by its watchdog; {WHAT_TO_DO[self.endpoints.elsewhere]}"
                 )
+            self._check_clock()
             acks, self._acks = tuple(self._acks), []
         newest = replace(newest, acks=acks)
         if reply is not None and newest.seq <= reply.seq:
@@ -145,7 +177,7 @@ class RemoteRobot:
 
     def request(self, request: Request) -> None:
         if isinstance(request, Heartbeat):
-            self._tell(request)
+            self._tell(Call(request=request, expires=time.monotonic() + HEARTBEAT_LIFE))
             return
         limit = {Reset: RESET_TIMEOUT, Resume: RESUME_TIMEOUT}.get(type(request), REQUEST_TIMEOUT)
         reply = self._ask(request, limit)
@@ -155,12 +187,12 @@ class RemoteRobot:
             self._reply = reply
             self._heard = time.monotonic()  # it answered: a reset that kept it busy is no silence
 
-    def _tell(self, message: Target | Heartbeat) -> None:
+    def _tell(self, message: Target | Call) -> None:
         with self._targets_lock:
             if self._closed:
                 raise RobotError("this link to the hw server was closed; make another")
             try:
-                self._targets.send(pack(message), zmq.NOBLOCK)
+                self._targets.send(pack(self.clock.theirs(message)), zmq.NOBLOCK)
             except zmq.Again:
                 self.unsent += 1
 
@@ -173,7 +205,8 @@ class RemoteRobot:
             number = str(self._request_number).encode()
             began = time.monotonic()
             try:
-                self._requests.send_multipart([number, pack(request)], zmq.NOBLOCK)
+                call = self.clock.theirs(Call(request=request, expires=began + limit))
+                self._requests.send_multipart([number, pack(call)], zmq.NOBLOCK)
                 while (waited := time.monotonic() - began) < limit:
                     if isinstance(request, Resume) and min(waited, self.silence()) > REQUEST_TIMEOUT:
                         limit = REQUEST_TIMEOUT  # an arm that is made ready takes its time, but its server is heard
@@ -200,9 +233,15 @@ class RemoteRobot:
                 self.request(Hold(reason="the app let go of the arm"))
         except RobotError as error:
             log.warning("letting go: %s", error)
+        self._let_go()
+
+    def _let_go(self) -> None:
         with self._targets_lock, self._requests_lock:
             self._closed = True
             self._targets.close()
             self._requests.close()
-        self._thread.join(timeout=2.0)
+        if self._clock_thread is not None:
+            self._clock_thread.close()
+        if self._thread.ident is not None:
+            self._thread.join(timeout=2.0)
         self._context.destroy(linger=0)

@@ -145,13 +145,14 @@ class StopRequest:
 
     source: str
     stamp: float
+    """Of the asker's clock; nothing is decided by it."""
 
 
 @register
 @dataclass(frozen=True, kw_only=True)
 class StopAck:
     latched: float
-    """Monotonic seconds at which the hw server latched."""
+    """Monotonic seconds at which the hw server latched, of its own clock."""
 
 
 @register
@@ -189,6 +190,7 @@ class View:
 
     seq: int
     stamp: float
+    """Of the hw server's own clock."""
     jpegs: Mapping[str, bytes]
     """Camera name to JPEG at the operator's size."""
     body_poses: Float[np.ndarray, "B 7"]

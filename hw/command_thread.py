@@ -11,10 +11,11 @@ from concurrent.futures import Future
 
 import zmq
 
-from far_app.endpoints import Endpoints, Reply
+from far_app.endpoints import Call, Endpoints, Reply
 from far_app.errors import RobotError
 from far_app.protocols import Heartbeat, Hold, Home, Reset, Resume
 from far_app.scheduling import MESSAGE_PRIORITY, real_time
+from far_app.station import ClockAnswer, ClockQuery, Station
 from far_app.telemetry import GeometryRequest, SceneGeometry
 from far_app.types import RobotMode, Target
 from far_app.wire import WireError, pack, unpack
@@ -35,10 +36,10 @@ class CommandThread:
 
     def __init__(
         self, servo: ServoThread, publisher: PublisherThread, geometry: Callable[[], SceneGeometry | None],
-        timing: PictureTiming, context: zmq.Context[zmq.Socket[bytes]], endpoints: Endpoints,
+        timing: PictureTiming, context: zmq.Context[zmq.Socket[bytes]], endpoints: Endpoints, station: Station,
     ) -> None:  # fmt: skip
         self._servo, self._publisher, self._geometry = servo, publisher, geometry
-        self._timing = timing
+        self._timing, self._station = timing, station
         self._context, self._endpoints = context, endpoints
         self._closing = False
         self._pending: list[tuple[Future[None], list[bytes]]] = []
@@ -59,47 +60,54 @@ class CommandThread:
     def _run(self) -> None:
         real_time(MESSAGE_PRIORITY)
         self._commands = self._context.socket(zmq.ROUTER)
-        geometry = self._context.socket(zmq.REP)
-        for socket, endpoint in ((self._commands, self._endpoints.commands), (geometry, self._endpoints.geometry)):
+        geometry, station = self._context.socket(zmq.REP), self._context.socket(zmq.REP)
+        at = self._endpoints
+        poller = zmq.Poller()
+        for socket, endpoint in ((self._commands, at.commands), (geometry, at.geometry), (station, at.station)):
             socket.setsockopt(zmq.LINGER, 0)
             socket.bind(endpoint)
+            poller.register(socket, zmq.POLLIN)
         self._bound.set()
-        poller = zmq.Poller()
-        poller.register(self._commands, zmq.POLLIN)
-        poller.register(geometry, zmq.POLLIN)
         while not self._closing:
             ready = dict(poller.poll(BUSY_MS if self._pending else PATIENCE_MS))
             if self._commands in ready:
                 self._serve(self._commands.recv_multipart())
+            if station in ready:
+                self._answer_station(station)
             if geometry in ready:
                 self._answer_geometry(geometry)
             self._finish_resets()
-        self._commands.close()
-        geometry.close()
+        for socket in (self._commands, geometry, station):
+            socket.close()
 
     def _serve(self, parts: list[bytes]) -> None:
         try:
             message = unpack(parts[-1])
         except WireError as error:
             return self._damaged(f"{error}", parts)
-        if len(parts) == 2 and isinstance(message, Target | Heartbeat):
-            self._take(message)
-        elif len(parts) == 3 and isinstance(message, Home | Hold | Resume | Heartbeat | Reset):
-            self._request(parts[:2], message)
+        now = time.monotonic()
+        if len(parts) == 2 and isinstance(message, Target):
+            self._take(message, now)
+        elif len(parts) == 2 and isinstance(message, Call) and isinstance(message.request, Heartbeat):
+            if now <= message.expires:
+                with self._servo.locked() as controller:
+                    controller.request(message.request, now)
+        elif len(parts) == 3 and isinstance(message, Call):
+            if now <= message.expires or isinstance(message.request, Hold):
+                self._request(parts[:2], message.request)
+            else:
+                name, late = type(message.request).__name__, now - message.expires
+                self._damaged(f"{name} came {late:.1f} s after its asker gave it up (a cut link?)", parts)
         else:
             self._damaged(f"a {type(message).__name__} in {len(parts) - 1} parts does not belong here", parts)
 
-    def _take(self, message: Target | Heartbeat) -> None:
+    def _take(self, target: Target, now: float) -> None:
         with self._servo.locked() as controller:
-            if isinstance(message, Target):
-                controller.offer(message, time.monotonic())
-            else:
-                controller.request(message, time.monotonic())
-        if isinstance(message, Target):
-            self._publisher.wake()
-            lead = self._publisher.lead(message.due)
-            if math.isfinite(lead):
-                self._servo.shift_pictures(self._timing.shift(lead))
+            controller.offer(target, now)
+        self._publisher.wake()
+        lead = self._publisher.lead(target.due)
+        if math.isfinite(lead):
+            self._servo.shift_pictures(self._timing.shift(lead))
 
     def _request(self, address: list[bytes], request: Home | Hold | Resume | Heartbeat | Reset) -> None:
         if isinstance(request, Reset):
@@ -149,3 +157,16 @@ class CommandThread:
         geometry = self._geometry()
         known = isinstance(request, GeometryRequest) and geometry is not None
         socket.send(pack(geometry) if known else b"", zmq.NOBLOCK)
+
+    def _answer_station(self, socket: zmq.Socket[bytes]) -> None:
+        received = time.monotonic()
+        try:
+            query = unpack(socket.recv())
+        except WireError as error:
+            log.warning("refused a question: %s", error)
+            query = None
+        if isinstance(query, ClockQuery):
+            answer = ClockAnswer(sent=query.sent, received=received, answered=time.monotonic())
+            socket.send(pack(answer), zmq.NOBLOCK)
+        else:
+            socket.send(pack(self._station), zmq.NOBLOCK)

@@ -1,13 +1,14 @@
-"""The hw server: the process that owns the arm and the cameras. `python -m hw.server --folder F --parent PID`.
+"""The hw server: the process that owns the arm and the cameras. `python -m hw.server --folder F --parent PID` beside
+the app, `far hw-server --bind tcp://ADDRESS:PORT` on a machine of its own.
 
     servo thread     plant, controller, safety filter, watchdog; nothing else touches the arm
     camera thread    draws; View to the page
     publisher        Observation to the app
-    command thread   targets, heartbeats, requests, geometry
+    command thread   targets, heartbeats, requests, geometry, what this station is and its clock
     stop thread      STOP, on its own context
 
-One line of JSON on standard output says {"ready": …}, or {"error": …, "kind": …} before a non-zero exit. Ends by
-SIGTERM or SIGINT, and by itself when its parent dies; the arm is held first.
+One line of JSON on standard output says {"ready": …}, or {"error": …, "kind": …} before a non-zero exit; in words when
+it was started by a person. Ends by SIGTERM or SIGINT, and by itself when its parent dies; the arm is held first.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 os.environ.setdefault("LP_NUM_THREADS", "1")  # before any GL: software drawing would take every core
@@ -30,10 +32,12 @@ import cv2
 import zmq
 
 from far_app.config import TaskConfig
-from far_app.endpoints import Endpoints
+from far_app.endpoints import HARDWARE, Endpoints
 from far_app.errors import ConfigError, FarError, RobotError
+from far_app.keys import server_keys
 from far_app.protocols import Hold
 from far_app.scheduling import PROMPT_NICENESS, SWITCH_INTERVAL, nice, prompt_context
+from far_app.station import Station
 from far_app.tasks import task as task_named
 from hw.camera_config import with_views
 from hw.camera_thread import CameraThread
@@ -77,6 +81,7 @@ class Server:
 
     def __init__(self, rig: RigConfig, task: TaskConfig, endpoints: Endpoints) -> None:
         self.context = prompt_context()
+        self.gate = endpoints.secure(self.context)
         self.plant, make_bodies = make_plant(rig, task)
         cameras = rig.cameras
         make_view = (lambda: HardwareView(make_bodies(), cameras)) if cameras else make_bodies
@@ -88,9 +93,10 @@ class Server:
         )
         timing = PictureTiming(1.0 / self.plant.servo_hz, 1.0 / task.rate)
         self.commands = CommandThread(
-            self.servo, self.publisher, lambda: self.cameras.geometry, timing, self.context, endpoints
-        )
-        self.stop = StopThread(self.servo, endpoints.stop)
+            self.servo, self.publisher, lambda: self.cameras.geometry, timing, self.context, endpoints,
+            Station(rig=asdict(rig), task=task.name),
+        )  # fmt: skip
+        self.stop = StopThread(self.servo, endpoints)
 
     def _lost(self, reason: str) -> None:
         with self.servo.locked() as controller:
@@ -112,6 +118,8 @@ class Server:
             time.sleep(BRAKING)
         for part in (self.commands, self.cameras, self.publisher, self.stop, self.servo, self.plant):
             part.close()
+        if self.gate is not None:
+            self.gate.close()
         self.context.destroy(linger=0)
         log.info("%s", self.servo.report())
         log.info("cameras: %d moments, %.1f ms each", self.cameras.drawn, self.cameras.milliseconds)
@@ -139,25 +147,46 @@ class Ending:
         self._told.set()
 
 
-def serve(
-    folder: Path, rig_name: str, task_name: str, parent: int | None, say: Callable[[dict[str, object]], None],
-    address: str = "",
-) -> None:  # fmt: skip
-    """Runs the server to its end."""
-    began = time.monotonic()
+def in_folder(folder: Path) -> Endpoints:
+    """Endpoints for an app on this machine; the folder is made. Raises ConfigError."""
     longest = len(str(folder / "observations").encode())
     if longest > SOCKET_NAME:
         raise ConfigError(
             f"sockets below {folder} need names of {longest} bytes, at most {SOCKET_NAME} fit; choose a shorter folder"
         )
     folder.mkdir(parents=True, exist_ok=True)
+    return Endpoints.in_folder(folder)
+
+
+def to_machines(address: str, keys: Path | None) -> Endpoints:
+    """Endpoints for an app on another machine. Raises ConfigError, also where a port is taken."""
+    endpoints = Endpoints.at(address, server_keys(keys) if keys is not None else None)
+    with zmq.Context() as context, context.socket(zmq.PAIR) as socket:
+        for name in HARDWARE:
+            endpoint = getattr(endpoints, name)
+            try:
+                socket.bind(endpoint)
+            except zmq.ZMQError as error:
+                raise ConfigError(
+                    f"cannot serve {name} at {endpoint}: {error}; {len(HARDWARE)} ports from {address} on must be "
+                    "free, and the address one of this machine's: is another hw server running?"
+                ) from error
+    return endpoints
+
+
+def serve(
+    endpoints: Endpoints, rig_name: str, task_name: str, parent: int | None, say: Callable[[dict[str, object]], None],
+    controller: str = "",
+) -> None:  # fmt: skip
+    """Runs the server to its end."""
+    began = time.monotonic()
     try:
-        rig = at_address(load_rig(rig_name, task_name), address)
+        rig = at_address(load_rig(rig_name, task_name), controller)
         task = with_views(task_named(task_name, rig.arm), rig.cameras)
-        server = Server(rig, task, Endpoints.in_folder(folder))
+        server = Server(rig, task, endpoints)
         server.start()
     except zmq.ZMQError as error:
-        raise RobotError(f"cannot serve below {folder}: {error}; choose another folder") from error
+        raise RobotError(f"cannot serve at {endpoints.commands}: {error}; choose another place") from error
     ending = Ending(parent)
     say({
         "ready": True, "pid": os.getpid(), "servo_hz": server.plant.servo_hz, "cameras": list(task.cameras),
@@ -170,7 +199,10 @@ def serve(
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m hw.server", description="Own the arm and its cameras.")
-    parser.add_argument("--folder", type=Path, required=True, help="where the ipc endpoints lie")
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument("--folder", type=Path, help="where the ipc endpoints lie")
+    where.add_argument("--bind", help="tcp://ADDRESS:PORT for an app on another machine")
+    parser.add_argument("--keys", type=Path, default=None, help="folder of the CURVE keys for --bind")
     parser.add_argument("--rig", default="twin", help="a rig's name or the path of its TOML file")
     parser.add_argument("--task", default="lift")
     parser.add_argument("--address", default="", help="ADDRESS[:PORT] of a real arm's controller, over the rig file's")
@@ -184,16 +216,23 @@ def main(arguments: list[str] | None = None) -> int:
     cv2.setNumThreads(1)
 
     def say(words: dict[str, object]) -> None:
-        handshake.write(json.dumps(words) + "\n")
+        handshake.write((_for_a_person(words, options.bind) if options.bind else json.dumps(words)) + "\n")
         handshake.flush()
 
     try:
-        serve(options.folder, options.rig, options.task, options.parent, say, options.address)
+        endpoints = in_folder(options.folder) if options.folder else to_machines(options.bind, options.keys)
+        serve(endpoints, options.rig, options.task, options.parent, say, options.address)
     except FarError as error:
         log.error("%s", error)
         say({"error": str(error), "kind": type(error).__name__})
         return 2
     return 0
+
+
+def _for_a_person(words: dict[str, object], address: str) -> str:
+    if "error" in words:
+        return f"far: {words['error']}"
+    return f"Ready at {address}: on the other machine say  far run --hw {address} …\nCtrl-C ends it; the arm is held."
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import time
 
 import zmq
 
+from far_app.endpoints import Endpoints
 from far_app.errors import RobotError
 from far_app.scheduling import STOP_PRIORITY, prompt_context, real_time
 from far_app.telemetry import StopAck, StopRequest
@@ -20,9 +21,10 @@ log = logging.getLogger(__name__)
 class StopThread:
     """Answers StopRequest with StopAck. Whatever else arrives on this socket is taken for a STOP as well."""
 
-    def __init__(self, servo: ServoThread, endpoint: str) -> None:
-        self._servo, self._endpoint = servo, endpoint
+    def __init__(self, servo: ServoThread, endpoints: Endpoints) -> None:
+        self._servo, self._endpoint = servo, endpoints.stop
         self._context = prompt_context()
+        self._gate = endpoints.secure(self._context)
         self._bound = threading.Event()
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="stop", daemon=True)
@@ -35,6 +37,8 @@ class StopThread:
     def close(self) -> None:
         self._closing = True
         self._thread.join(timeout=2.0)
+        if self._gate is not None:
+            self._gate.close()
         self._context.destroy(linger=0)
 
     def _run(self) -> None:

@@ -32,10 +32,12 @@ def fake() -> Iterator[FakeXArm]:
 class Run:
     """`far run` and its page, read and pressed as a browser would."""
 
-    def __init__(self, fake: FakeXArm, recordings: Path, *words: str) -> None:
+    def __init__(self, fake: FakeXArm, recordings: Path, *words: str, server: tuple[str, ...] = ()) -> None:
+        """`server`: words that name an hw server on another machine in place of one of its own."""
         self.fake = fake
         command = [sys.executable, "-u", "-c", "import sys; from far_app.cli import main; sys.exit(main(sys.argv[1:]))"]
-        command += ["run", "--robot", "xarm", "--host", f"{fake.address}:{FAKE_PORT}", "--policy", "test:wander"]
+        server = server or ("--host", f"{fake.address}:{FAKE_PORT}")
+        command += ["run", "--robot", "xarm", *server, "--policy", "test:wander"]
         command += ["--port", "0", "--no-rerun", "--recordings", str(recordings), *words]
         self.process = subprocess.Popen(
             command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL

@@ -115,9 +115,11 @@ class Feeds:
 
     def __init__(self, endpoints: Endpoints) -> None:
         self._context = zmq.Context(io_threads=1)
+        self._hardware: zmq.Context[Any] = zmq.Context(io_threads=1)
+        endpoints.secure(self._hardware)
         self.telemetry = Latest(self._context, endpoints.telemetry, Telemetry)
-        self.view = Latest(self._context, endpoints.view, View)
-        self.geometry = Geometry(self._context, endpoints.geometry)
+        self.view = Latest(self._hardware, endpoints.view, View)
+        self.geometry = Geometry(self._hardware, endpoints.geometry)
         self._intents = self._context.socket(zmq.PUSH)
         self._intents.setsockopt(zmq.LINGER, 0)
         self._intents.setsockopt(zmq.SNDHWM, 8)
@@ -144,3 +146,4 @@ class Feeds:
         self.geometry.close()
         self._intents.close()
         self._context.term()
+        self._hardware.term()

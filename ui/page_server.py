@@ -20,19 +20,20 @@ import websockets.asyncio.server as websocket_server
 from viser import _messages as messages
 
 from far_app.errors import ConfigError
+from ui.presence import Presence
 
 MAX_MESSAGE = 2**18
 """Bytes a client may send at once; clicks and camera poses are far below."""
 
 
-def open_page(host: str, port: int) -> viser.ViserServer:
-    """A running server on exactly this address; give it Presses at once.
+def open_page(host: str, port: int, presence: Presence) -> viser.ViserServer:
+    """A running server on exactly this address, its connections watched by `presence`; give it Presses at once.
 
     Raises ConfigError when the address is not loopback or the port is taken."""
     listener = _listen(host, port)
     bound = int(listener.getsockname()[1])
     logging.getLogger("websockets.server").setLevel(logging.ERROR)
-    with _serving(listener, bound), contextlib.redirect_stdout(io.StringIO()):
+    with _serving(listener, bound, presence), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=bound, verbose=False)
     if server.get_port() != bound:
         server.stop()
@@ -75,13 +76,13 @@ def allowed_origins(port: int) -> list[re.Pattern[str] | None]:
 
 
 @contextlib.contextmanager
-def _serving(listener: socket.socket, port: int) -> Iterator[None]:
-    """While a ViserServer starts, its websocket server gets our socket and our Origins."""
+def _serving(listener: socket.socket, port: int, presence: Presence) -> Iterator[None]:
+    """While a ViserServer starts, its websocket server gets our socket, our Origins and our look at who is there."""
     original = websocket_server.serve
 
     def serve(handler: Any, host: Any = None, wanted: Any = None, **kwargs: Any) -> Any:
         kwargs.update(sock=listener, origins=allowed_origins(port), max_size=MAX_MESSAGE)
-        return original(handler, **kwargs)
+        return original(presence.around(handler), **kwargs)
 
     websocket_server.serve = serve  # type: ignore[assignment]
     try:

@@ -27,6 +27,7 @@ from ui.feeds import Feeds
 from ui.live_viewer import LiveViewer
 from ui.page_server import open_page, page_url
 from ui.parent import die_with_parent
+from ui.presence import Presence
 from ui.stop import StopLine, hasten
 from ui.view_model import Freshness
 
@@ -73,19 +74,20 @@ class Page:
     def __init__(self, options: PageOptions) -> None:
         self._options = options
         endpoints = Endpoints.in_folder(options.run_folder)
-        self._server = open_page(options.host, options.port)
+        self._presence = Presence()
+        self._server = open_page(options.host, options.port, self._presence)
         self.port = self._server.get_port()
         listener = self._server._websock_server._server_thread
         if listener is not None and listener.native_id is not None:
             hasten(listener.native_id)  # the thread that hears STOP
         self._feeds = Feeds(endpoints)
-        self._stop_line = StopLine(endpoints.stop)
+        self._stop_line = StopLine(endpoints)
         self._console = Console(
             self._server, self._stop_line, self._latest, scene3d=options.scene3d, cameras=options.cameras
         )
         self._viewer = LiveViewer(options.run_folder, options.recordings) if options.rerun else None
         self._plots, self._texts, self._trails, self._beats = Every(1 / 5), Every(1 / 5), Every(1 / 5), Every(1 / 2)
-        self._presence = Every(1 / 4)
+        self._telling = Every(1 / 4)
         self._hw_seq = 0
 
     def _latest(self) -> tuple[Telemetry | None, Freshness]:
@@ -99,8 +101,8 @@ class Page:
         now = time.monotonic()
         heard = self._feeds.telemetry.poll()
         telemetry, fresh = self._latest()
-        if self._presence(now):
-            self._feeds.present(len(self._server.get_clients()))
+        if self._telling(now):
+            self._feeds.present(self._presence.count())
         with self._server.atomic():
             self._show_view()
             if self._beats(now):

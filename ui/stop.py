@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import zmq
 
+from far_app.endpoints import Endpoints
 from far_app.telemetry import StopAck, StopRequest
 from far_app.wire import WireError, pack, unpack
 
@@ -25,15 +26,15 @@ class StopResult:
     latched: bool | None
     """None while under way."""
     latency_ms: float = float("nan")
-    """From the press to the latch in the hw server."""
+    """From the press until the hw server's word that it latched was heard here."""
     tries: int = 0
 
 
 class StopLine:
     """press() returns at once and may be called from any thread; result tells how it went."""
 
-    def __init__(self, endpoint: str) -> None:
-        self._endpoint = endpoint
+    def __init__(self, endpoints: Endpoints) -> None:
+        self._endpoints = endpoints
         self._pressed = threading.Event()
         self._closing = False
         self._source = ""
@@ -53,42 +54,49 @@ class StopLine:
 
     def _serve(self) -> None:
         hasten(threading.get_native_id())
-        context = zmq.Context(io_threads=1)
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
+        self._endpoints.secure(context)
+        socket = self._connected(context)
         while True:
             self._pressed.wait()
             self._pressed.clear()
             if self._closing:
                 break
             self.result = StopResult(pressed=self._since, latched=None)
-            self.result = self._stop(context, self._since)
+            socket, self.result = self._stop(context, socket, self._since)
         context.destroy(linger=0)
 
-    def _stop(self, context: zmq.Context[zmq.Socket[bytes]], pressed: float) -> StopResult:
-        request = pack(StopRequest(source=self._source, stamp=pressed))
-        for attempt in range(1, TRIES + 1):
-            answer = self._ask(context, request)
-            if answer is not None:
-                latency = 1000 * max(0.0, answer.latched - pressed)
-                return StopResult(pressed=pressed, latched=True, latency_ms=latency, tries=attempt)
-            if self._closing:
-                break
-        return StopResult(pressed=pressed, latched=False, tries=TRIES)
-
-    def _ask(self, context: zmq.Context[zmq.Socket[bytes]], request: bytes) -> StopAck | None:
-        """One try on a fresh REQ socket: a REQ that timed out can never be used again."""
+    def _connected(self, context: zmq.Context[zmq.Socket[bytes]]) -> zmq.Socket[bytes]:
+        """A connection that stands before STOP is pressed: between two machines its handshake takes its time."""
         socket = context.socket(zmq.REQ)
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.RCVTIMEO, int(1000 * PATIENCE))
         socket.setsockopt(zmq.SNDTIMEO, int(1000 * PATIENCE))
-        try:
-            socket.connect(self._endpoint)
-            socket.send(request)
-            answer = unpack(socket.recv())
-        except (zmq.ZMQError, WireError):
-            return None
-        finally:
+        socket.connect(self._endpoints.stop)
+        return socket
+
+    def _stop(
+        self, context: zmq.Context[zmq.Socket[bytes]], socket: zmq.Socket[bytes], pressed: float
+    ) -> tuple[zmq.Socket[bytes], StopResult]:
+        """Ask until it is confirmed, each time on a fresh socket: a REQ that timed out can never be used again. Returns
+        the socket for the next time."""
+        request = pack(StopRequest(source=self._source, stamp=pressed))
+        for attempt in range(1, TRIES + 1):
+            if self._ask(socket, request):
+                latency = 1000 * (time.monotonic() - pressed)
+                return socket, StopResult(pressed=pressed, latched=True, latency_ms=latency, tries=attempt)
             socket.close()
-        return answer if isinstance(answer, StopAck) else None
+            socket = self._connected(context)
+            if self._closing:
+                break
+        return socket, StopResult(pressed=pressed, latched=False, tries=TRIES)
+
+    def _ask(self, socket: zmq.Socket[bytes], request: bytes) -> bool:
+        try:
+            socket.send(request)
+            return isinstance(unpack(socket.recv()), StopAck)
+        except (zmq.ZMQError, WireError):
+            return False
 
 
 def hasten(thread: int) -> None:

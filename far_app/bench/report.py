@@ -10,5 +10,10 @@ from typing import Any
 def write(report: dict[str, Any], path: Path | None) -> None:
     text = json.dumps(report, indent=2)
     print(text, flush=True)
+    keep(report, path)
+
+
+def keep(report: dict[str, Any], path: Path | None) -> None:
+    """What is known so far, should the rest never come."""
     if path is not None:
-        path.write_text(text + "\n")
+        path.write_text(json.dumps(report, indent=2) + "\n")

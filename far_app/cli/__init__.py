@@ -11,6 +11,8 @@ from far_app.errors import FarError
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("far_app.cli.run", "supervised trials: try, notice failure, learn, retry; with the operator page"),
+    "hw-server": ("far_app.cli.hw_server", "own the arm on a machine of its own, for far run --hw on another"),
+    "keys": ("far_app.cli.keys", "make the keys with which two machines trust each other"),
     "demo": ("far_app.cli.demo", "make demonstrations with the scripted expert"),
     "train policy": ("far_app.cli.train_policy", "train the diffusion policy on demonstrations"),
     "train critic": ("far_app.cli.train_critic", "train the IQL critic on demonstrations"),
@@ -36,6 +38,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "bench success": ("far_app.bench.success", "a success detector against the twin's own check, on held-out attempts"),
     "bench alarm": ("far_app.bench.alarm", "what an early failure alarm would have saved and lost"),
     "bench faults": ("far_app.bench.faults", "a real arm's faults on the fake controller: held, told, resumed"),
+    "bench link": ("far_app.bench.link", "two machines: offset of clocks, holds and jumps on a slow, stalling link"),
     "fake-xarm": ("hw.fake_xarm.__main__", "a controller that speaks an xArm7's protocols: try a real arm's path"),
     "doctor": ("far_app.cli.doctor", "what this machine has, and what to do about what it lacks"),
 }

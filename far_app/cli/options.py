@@ -33,6 +33,10 @@ class RunOptions:
     """Name below hw/rigs, or the path of a rig's TOML file; the robot's own by default (twin, xarm7)."""
     host: str = ""
     """ADDRESS[:PORT] of a real arm's controller, over the rig file's."""
+    hw: str = ""
+    """tcp://HOST:PORT of `far hw-server` on another machine; started here when empty."""
+    keys: Path | None = None
+    """Folder of the CURVE keys for --hw (see far keys)."""
     full_speed: bool = False
     """Real arm: the session's first attempt too runs at the policy's own speed."""
     policy: str | None = None
@@ -84,12 +88,15 @@ class RunOptions:
         rig = at_address(load_rig(self.rig_file, self.task), self.host)
         if self.robot not in (None, rig.robot):
             raise ConfigError(f"--robot is {self.robot}, but rig {rig.name} ({self.rig_file}) is a {rig.robot}")
+        return rig
+
+    def refuse_unwatched(self, rig: RigConfig) -> None:
+        """Raise ConfigError where nobody would watch a real arm."""
         if self.headless and rig.robot == "xarm" and not rig.xarm.address.startswith("127."):
             raise ConfigError(
                 f"--headless is for the twin and the fake controller: a real arm (at {rig.xarm.address}) needs "
                 "somebody who watches its page"
             )
-        return rig
 
     def __post_init__(self) -> None:
         limits = {"trials": 0, "seed": 0, "torch_threads": 1, "max_attempts": 1}
@@ -97,3 +104,10 @@ class RunOptions:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ConfigError(f"--{name.replace('_', '-')} is {value}, must be at least {least}")
+        if self.hw and self.host:
+            raise ConfigError(
+                f"--host {self.host} is where the hw server finds the arm's controller; with --hw {self.hw} that is "
+                "said on the other machine: far hw-server --host …"
+            )
+        if self.keys is not None and not self.hw:
+            raise ConfigError("--keys are for a hw server on another machine; say --hw tcp://HOST:PORT as well")

@@ -73,7 +73,8 @@ def run(options: RunOptions) -> tuple[list[TrialResult], LoopStatistics]:
             with stage_.session(writer, inbox, statistics) as session:
                 session.run()
         except SessionFault as fault:
-            stage_.hardware.check(f"{fault}; ")
+            if stage_.hardware is not None:
+                stage_.hardware.check(f"{fault}; ")
             raise
         finally:
             inbox.close()

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from far_app.cli.agreement import agreed
 from far_app.cli.assemble import Parts, assemble, check_observation
 from far_app.cli.detector import failure_alarm, learned_detector
 from far_app.cli.options import RunOptions
@@ -26,7 +27,7 @@ from far_app.cli.preflight import policy_card, preflight
 from far_app.cli.processes import Child, Family, run_folder
 from far_app.config import TaskConfig
 from far_app.detectors import PersonJudge, TwinCheck
-from far_app.endpoints import Endpoints
+from far_app.endpoints import Endpoints, note_elsewhere
 from far_app.errors import FarError, RobotError
 from far_app.link import RemoteRobot
 from far_app.protocols import Method, PlanRequest, Policy, SuccessDetector
@@ -41,6 +42,7 @@ from far_app.session.recorder import Recorder
 from far_app.session.session import Session, SessionSettings
 from far_app.session.shadow import ShadowRobot
 from far_app.session.statistics import LoopStatistics
+from far_app.station import station_at
 from far_app.tasks import supervised
 from far_app.tasks import task as find_task
 from hw.camera_config import with_views
@@ -67,7 +69,8 @@ class Stage:
     robot: RemoteRobot
     folder: Path
     family: Family
-    hardware: Child
+    hardware: Child | None
+    """The hw server, where it is ours."""
     page: Child | None
     page_url: str
 
@@ -150,7 +153,7 @@ def stage(options: RunOptions) -> Iterator[Stage]:
     with run_folder() as folder, contextlib.ExitStack() as stack:
         family = Family()
         stack.callback(family.end)
-        hardware = family.add(start_hardware(folder, options.rig_file, options.task, options.host))
+        hardware, rig = find_hardware(folder, family, options, rig)
         page = None if options.headless else family.add(start_page(folder, options, port, task.cameras))
         parts = assemble(
             options.method, task, options.policy, options.critic, options.device, options.retry, options.engine
@@ -178,6 +181,21 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         )  # fmt: skip
 
 
+def find_hardware(
+    folder: Path, family: Family, options: RunOptions, rig: RigConfig
+) -> tuple[Child | None, RigConfig]:  # fmt: skip
+    """The hw server's process, or none where it runs on another machine and drives just this rig; and the rig with the
+    arm's address. Raises ConfigError and RobotError."""
+    if not options.hw:
+        options.refuse_unwatched(rig)
+        return family.add(start_hardware(folder, options.rig_file, options.task, options.host)), rig
+    note_elsewhere(folder, options.hw, options.keys)
+    station = station_at(Endpoints.in_folder(folder))
+    rig = agreed(rig, options.task, station)
+    options.refuse_unwatched(rig)
+    return None, rig
+
+
 def start_hardware(folder: Path, rig: str, task: str, address: str) -> Child:
     arguments = ["--folder", str(folder), "--rig", rig, "--task", task, "--parent", str(os.getpid())]
     arguments += ["--address", address] * bool(address)
@@ -192,14 +210,15 @@ def start_page(folder: Path, options: RunOptions, port: int, cameras: Sequence[s
 
 
 @contextlib.contextmanager
-def connected(folder: Path, hardware: Child) -> Iterator[RemoteRobot]:
+def connected(folder: Path, hardware: Child | None) -> Iterator[RemoteRobot]:
     """The robot behind the hw server, once it shows its first observation."""
     deadline = time.monotonic() + HARDWARE_PATIENCE
     robot = None
     while robot is None:
-        hardware.check()
+        if hardware is not None:
+            hardware.check()
         try:
-            robot = RemoteRobot(Endpoints.in_folder(folder), connect_timeout=1.0)
+            robot = RemoteRobot(Endpoints.in_folder(folder), connect_timeout=1.0 if hardware is not None else 5.0)
         except RobotError as error:
             if time.monotonic() > deadline:
                 raise RobotError(

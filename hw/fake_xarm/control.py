@@ -50,6 +50,11 @@ class FakeXArm:
         fake._process = process
         return fake
 
+    @property
+    def pid(self) -> int | None:
+        """Of its process, when `start` made it."""
+        return self._process.pid if self._process is not None else None
+
     def tell(self, **words: Any) -> dict[str, Any]:
         """One request; the answer. Raises RobotError where the fake does not understand."""
         self._file.write(json.dumps(words) + "\n")
@@ -72,7 +77,7 @@ class FakeXArm:
         self.tell(do="faults", set=values, stall_in=stall_in)
 
     def received(self) -> list[dict[str, Any]]:
-        """What came in since last asked (hw.fake_xarm.controller.Received as dicts)."""
+        """What came in since last asked (hw.fake_xarm.received.Received as dicts)."""
         return self.tell(do="received")["received"]
 
     def servo_targets(self) -> list[dict[str, Any]]:

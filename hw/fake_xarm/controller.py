@@ -13,37 +13,18 @@ import logging
 import socket
 import struct
 import time
-from collections import deque
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 
 from far_app.errors import RobotError
 from hw.fake_xarm.arm import FakeArm
-from hw.fake_xarm.commands import SERVO, answer, servo_pose
+from hw.fake_xarm.commands import answer
 from hw.fake_xarm.faults import Faults
 from hw.fake_xarm.gripper import FakeGripper
-from hw.fake_xarm.protocol import Function, Request, take_request
+from hw.fake_xarm.protocol import Request, take_request
+from hw.fake_xarm.received import ReceivedLog
 from hw.fake_xarm.reports import PORTS, RATES, report
 
 log = logging.getLogger(__name__)
-
-KEPT = 400_000
-"""Requests remembered."""
-POLLED = (Function.GET_STATE, Function.GET_ERROR, Function.GET_CMDNUM, Function.RS485)
-"""Requests that are not remembered: they move nothing."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Received:
-    """One request as it came off the wire."""
-
-    at: float
-    """Monotonic seconds; the same clock in every process of a machine."""
-    connection: int
-    function: int
-    argument: int
-    """First byte of the data: the state or mode asked for."""
-    pose: tuple[float, ...] = ()
-    """Servo targets: x, y, z in millimetres and the quaternion (xyzw)."""
 
 
 class FakeController:
@@ -52,9 +33,7 @@ class FakeController:
     def __init__(self, address: str, port: int, control_port: int) -> None:
         self.address, self.port, self.control_port = address, port, control_port
         self.arm, self.gripper, self.faults = FakeArm(), FakeGripper(), Faults()
-        self.received: deque[Received] = deque(maxlen=KEPT)
-        self.dropped = 0
-        """Requests forgotten because of `KEPT`, or taken out by a reader."""
+        self.received = ReceivedLog()
         self._began = self._advanced = time.monotonic()
         self._writers: set[asyncio.StreamWriter] = set()
         self._servers: list[asyncio.Server] = []
@@ -138,7 +117,7 @@ class FakeController:
         arrived = time.monotonic()
         if self.faults.mute:
             return
-        self._remember(request, connection, arrived)
+        self.received.remember(request, connection, arrived)
         delay = self.faults.delay()
         if delay:
             await asyncio.sleep(delay / 2)
@@ -148,20 +127,6 @@ class FakeController:
             await asyncio.sleep(delay / 2)
         if not self.faults.mute:
             writer.write(frame)
-
-    def _remember(self, request: Request, connection: int, arrived: float) -> None:
-        if request.function in POLLED:
-            return
-        pose: tuple[float, ...] = ()
-        if request.function in SERVO[:2] and len(request.payload) >= 24:
-            position, quaternion = servo_pose(request)
-            pose = (*position.tolist(), *quaternion.tolist())
-        if len(self.received) == KEPT:
-            self.dropped += 1
-        first = request.payload[-1] if request.function == Function.MOTION_EN else (request.payload or b"\0")[0]
-        self.received.append(
-            Received(at=arrived, connection=connection, function=request.function, argument=first, pose=pose)
-        )
 
     # ── reports ──
 
@@ -223,8 +188,7 @@ class FakeController:
             case "set":
                 setattr(self.arm, words["name"], words["value"])
             case "received":
-                taken = [asdict(self.received.popleft()) for _ in range(len(self.received))]
-                return {"received": taken}
+                return {"received": [asdict(received) for received in self.received.take()]}
             case "state":
                 pass
             case "end":

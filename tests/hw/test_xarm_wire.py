@@ -137,6 +137,7 @@ def test_only_resume_leads_out_of_a_stop(cell: Cell, fake: FakeXArm) -> None:
     assert not fake.received(), "no servo target, no mode, no cleared error without the operator"
 
 
+@pytest.mark.slow
 def test_the_gripper_follows_without_stalling_the_servo_loop(cell: Cell, fake: FakeXArm) -> None:
     cell.go_home()
     writes, fake_at = fake.state()["gripper_writes"], fake.state()
@@ -153,6 +154,7 @@ def test_the_gripper_follows_without_stalling_the_servo_loop(cell: Cell, fake: F
     assert cell.servo.newest.measured.gripper > 0.95
 
 
+@pytest.mark.slow
 def test_starting_leaves_what_the_hand_holds_in_the_hand(fake: FakeXArm) -> None:
     rig = rig_at(fake, FAKE_PORT)
     first = Cell(fake, rig)
@@ -167,6 +169,7 @@ def test_starting_leaves_what_the_hand_holds_in_the_hand(fake: FakeXArm) -> None
     second.close()
 
 
+@pytest.mark.slow
 def test_a_g2_gripper_is_told_millimetres(fake: FakeXArm) -> None:
     rig = rig_at(fake, FAKE_PORT)
     g2 = replace(rig.xarm.gripper, kind="g2", open=84.0, closed=0.0, speed=150.0)

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from far_app.errors import ConfigError
 from far_app.session_states import Intent
 from far_app.types import RobotMode
 from ui.page_server import open_page
+from ui.presence import Presence
 from ui.raw_client import RawClient
 from ui.stop import StopLine
 
@@ -48,7 +50,7 @@ def test_a_taken_port_is_an_error_that_names_it(folder: Path, port: int) -> None
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.7", "example.org"])
 def test_only_loopback_is_served(host: str) -> None:
     with pytest.raises(ConfigError, match="loopback"):
-        open_page(host, 0)
+        open_page(host, 0, Presence())
 
 
 def test_foreign_origins_are_refused_and_our_own_are_not(start_page: Start, stage: Stage) -> None:
@@ -174,7 +176,7 @@ def gone(pid: int) -> bool:
 
 def test_the_stop_line_gives_up_and_works_again(folder: Path) -> None:
     """A REQ that timed out is never reused: the next press works once the hw server is there."""
-    line = StopLine(Endpoints.in_folder(folder).stop)
+    line = StopLine(Endpoints.in_folder(folder))
     line.press("test")
     assert wait_until(lambda: line.result is not None and line.result.latched is False)
     stage = Stage(folder)
@@ -188,9 +190,26 @@ def test_the_stop_line_gives_up_and_works_again(folder: Path) -> None:
 def test_a_press_does_not_wait_for_the_hw_server(folder: Path) -> None:
     stage = Stage(folder)
     stage.stop_answers = False
-    line = StopLine(Endpoints.in_folder(folder).stop)
+    line = StopLine(Endpoints.in_folder(folder))
     line.press("test")
     assert line.result is None or line.result.latched is None
     assert wait_until(lambda: len(stage.stops) == 1)
     line.close()
     stage.close()
+
+
+def test_a_frozen_browser_does_not_count_as_somebody_who_looks(start_page: Start, stage: Stage) -> None:
+    page = start_page()
+    look = f"from ui.raw_client import RawClient; c = RawClient({page.url!r}); c.read(60)"
+    browser = subprocess.Popen([sys.executable, "-c", look])
+    try:
+        assert wait_until(lambda: bool(stage.present) and stage.present[-1].clients == 1)
+        browser.send_signal(signal.SIGSTOP)
+        frozen = time.monotonic()
+        assert wait_until(lambda: stage.present[-1].clients == 0, 5.0)
+        assert time.monotonic() - frozen < 2.5
+        browser.send_signal(signal.SIGCONT)
+        assert wait_until(lambda: stage.present[-1].clients == 1, 5.0), "and counts again when it is awake"
+    finally:
+        browser.kill()
+        browser.wait()
