@@ -137,6 +137,8 @@ def test_a_secret_that_others_can_read_or_that_is_missing_is_refused(tmp_path: P
 def test_without_keys_any_address_but_loopback_is_refused_on_both_sides(
     address: str, capsys: pytest.CaptureFixture[str]
 ):
+    with pytest.raises(ConfigError, match="far keys --out"):
+        Endpoints.at(address, None)
     for command in (["hw-server", "--bind", address], ["run", "--headless", "--policy", "test:still", "--hw", address]):
         assert main(command) == 2
         assert "without keys anybody there could move the arm" in capsys.readouterr().err

@@ -88,6 +88,8 @@ class RunOptions:
         rig = at_address(load_rig(self.rig_file, self.task), self.host)
         if self.robot not in (None, rig.robot):
             raise ConfigError(f"--robot is {self.robot}, but rig {rig.name} ({self.rig_file}) is a {rig.robot}")
+        if not self.hw:
+            self.refuse_unwatched(rig)
         return rig
 
     def refuse_unwatched(self, rig: RigConfig) -> None:

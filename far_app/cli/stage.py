@@ -187,7 +187,6 @@ def find_hardware(
     """The hw server's process, or none where it runs on another machine and drives just this rig; and the rig with the
     arm's address. Raises ConfigError and RobotError."""
     if not options.hw:
-        options.refuse_unwatched(rig)
         return family.add(start_hardware(folder, options.rig_file, options.task, options.host)), rig
     note_elsewhere(folder, options.hw, options.keys)
     station = station_at(Endpoints.in_folder(folder))

@@ -100,7 +100,8 @@ def test_an_error_from_before_the_start_waits_for_the_operator(fake: FakeXArm) -
     cell.close()
 
 
-@pytest.mark.parametrize("how", [{"do": "cut"}, {"do": "cut", "reset": True}, {"do": "restart", "seconds": 0.5}],
+@pytest.mark.parametrize("how", [{"do": "cut"}, {"do": "cut", "reset": True},
+                                  pytest.param({"do": "restart", "seconds": 0.5}, marks=pytest.mark.slow)],
                          ids=["FIN", "RST", "restart"])  # fmt: skip
 def test_a_lost_connection_is_a_fault_and_resume_connects_anew(cell: Cell, fake: FakeXArm, how: dict) -> None:
     status = while_driving(cell, lambda: fake.tell(**how))
