@@ -195,6 +195,8 @@ LINES = {
     "attempt_abandoned": "the attempt ended without an outcome; `text` says why, `detail.steps`",
     "adapted": "`detail.status`, `detail.base_version`, `detail.version`, `detail.flagged`, `detail.pairs`",
     "outcome_marked": "someone's word on an attempt: `detail.success`, `detail.judged_by`, `detail.note`",
+    "flag_corrected": "the operator's word on a chunk: `detail.trial`, `detail.attempt`, `detail.tick`, "
+    "`detail.flagged`, `detail.by`, `detail.used` (it came in time for the adaptation)",
     "trial_ended": "`detail.success`, `detail.attempts`",
     "recording_failed": "the writer gave up; `text` says why",
     "recorder_late": "the writer was more than 1 s behind the loop; `detail.seconds`",
