@@ -113,10 +113,20 @@ def _positives(contrast: Contrast | None, note: str) -> str:
 {rows}</tbody></table>{more}"""
 
 
+def key() -> str:
+    """What the colours of the 3D view mean."""
+    kinds = (
+        ("#ff3c40", "sent"), ("linear-gradient(90deg, rgb(235,150,0), rgb(0,190,90))", "better, by Q"),
+        ("#6e7a88", "sampled before"), ("#a050ff", "after adapting"), ("#486280", "the hand's way"), ("#d6a03c", "objects"),
+    )  # fmt: skip
+    parts = "".join(f'<span><i style="background:{color}"></i>{escape(word)}</span>' for color, word in kinds)
+    return f'<div class="why-key">{parts}</div>'
+
+
 def lesson(answer: Answer | None, moved: str) -> str:
     """Adapt again: l⁺ and l⁻ over the steps, and how far sampled chunks moved."""
     if answer is None:
-        body = '<p class="why-note">Adapt again shows how the lesson changes the policy: l⁺, l⁻, and sampled paths.</p>'
+        body = '<p class="why-note long">Shows how the lesson changes the policy: l⁺, l⁻ and sampled paths.</p>'
         return f'<div class="far-card why-lesson" id="why-lesson"><h2>Adapt again</h2>{body}</div>'
     state = answer.error or answer.stage or "done"
     history = answer.history

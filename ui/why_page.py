@@ -87,6 +87,7 @@ class WhyPage:
         self._add_slider(Press.HORIZON, "H, ticks of a chunk", 1, 32, 1)
         self._lesson = gui.add_html(why_html.lesson(None, ""))
         self._frames = gui.add_html(why_html.frames(None, 0, 0, False))
+        gui.add_html(why_html.key())
         self._charts = gui.add_html(why_html.charts(None, 0))
         self._numbers = gui.add_html(why_html.numbers(None, None, 0, ""))
         self._foot = gui.add_html(why_html.foot("", (), "", ""))

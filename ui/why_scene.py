@@ -26,7 +26,7 @@ class WhyScene:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._scene = server.scene
-        server.initial_camera.position = (0.11, -0.13, 0.09)
+        server.initial_camera.position = (0.085, -0.1, 0.07)
         server.initial_camera.look_at = (0.0, 0.0, 0.01)
         server.initial_camera.fov = 0.7
         self._scene.configure_default_lights(enabled=False)
@@ -60,7 +60,6 @@ class WhyScene:
             self._ball("hand", here.eef.position, (235, 240, 245), 0.0032, drawn)
             for name, pose in here.objects.items():
                 self._ball(f"object/{name}", pose.position, OBJECT, 0.006, drawn)
-                self._label(f"object/{name}/label", name, np.asarray(pose.position) + (0, 0, 0.012), drawn)
         for name in self._drawn - drawn:
             self._scene.remove_by_name(name)
         self._drawn = drawn
@@ -87,6 +86,7 @@ class WhyScene:
         self, name: str, points: Float[np.ndarray, "N 3"], colors: np.ndarray, thickness: float, drawn: set[str]
     ) -> None:
         segments = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
+        colors = (255 * (colors / 255) ** 2.2).astype(np.uint8)  # lines' colours are taken as linear light
         self._scene.add_line_segments(f"/world/{name}", segments, colors, thickness=thickness)
         drawn.add(f"/world/{name}")
 
@@ -97,8 +97,4 @@ class WhyScene:
         self._scene.add_icosphere(
             f"/world/{name}", radius=radius, color=(r, g, b), position=tuple(np.asarray(at, float))
         )
-        drawn.add(f"/world/{name}")
-
-    def _label(self, name: str, text: str, at: np.ndarray, drawn: set[str]) -> None:
-        self._scene.add_label(f"/world/{name}", text, position=tuple(at))
         drawn.add(f"/world/{name}")

@@ -115,7 +115,7 @@ def change_chart(found: Attribution, tick: int, height: int = 126) -> str:
     return axes.svg("why-dv", body)
 
 
-def lesson_chart(history: Sequence[AdaptationStep], height: int = 170) -> str:
+def lesson_chart(history: Sequence[AdaptationStep], height: int = 130) -> str:
     """l⁺ (green) and l⁻ (red) over the gradient steps, each relative to its start, per cent."""
     steps = history[-1].steps if history else 10
     change = [np.full(steps + 1, np.nan) for _ in range(2)]

@@ -211,4 +211,4 @@ def _moved_words(pair: tuple[np.ndarray, np.ndarray], scale: float) -> str:
     """How far the ends of the sampled chunks moved."""
     before, after = (scale * np.asarray(chunks)[..., :3].sum(axis=1) for chunks in pair)
     apart = 1000 * np.linalg.norm(after - before, axis=1)
-    return f"here the ends of sampled chunks moved {apart.mean():.1f} mm (grey before, violet after)"
+    return f"moved {apart.mean():.1f} mm, grey → violet"
