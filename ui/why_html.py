@@ -117,7 +117,8 @@ def key() -> str:
     """What the colours of the 3D view mean."""
     kinds = (
         ("#ff3c40", "sent"), ("linear-gradient(90deg, rgb(235,150,0), rgb(0,190,90))", "better, by Q"),
-        ("#6e7a88", "sampled before"), ("#a050ff", "after adapting"), ("#486280", "the hand's way"), ("#d6a03c", "objects"),
+        ("#6e7a88", "sampled before"), ("#a050ff", "after adapting"),
+        ("#486280", "the hand's way"), ("#d6a03c", "objects"),
     )  # fmt: skip
     parts = "".join(f'<span><i style="background:{color}"></i>{escape(word)}</span>' for color, word in kinds)
     return f'<div class="why-key">{parts}</div>'
