@@ -182,6 +182,19 @@ class Outcome:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FlagCorrection:
+    """The operator's word on one chunk: it is to blame, or it is not, whatever ΔV says."""
+
+    tick: int
+    """Tick at which the chunk begins."""
+    flagged: bool
+    by: str = ""
+    """Who said so."""
+    wall: str = ""
+    """When, ISO 8601 with the offset to UTC."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Attempt:
     """One execution of the policy, up to the task's horizon."""
 
@@ -193,6 +206,23 @@ class Attempt:
     """The observation after the last step (s_T)."""
     outcome: Outcome
     policy_version: str
+    corrections: tuple[FlagCorrection, ...] = ()
+    """The operator's words on its chunks, oldest first; the last on a tick counts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contrast:
+    """What one flagged chunk was compared with: its positives, best Q first."""
+
+    tick: int
+    negative_q: float
+    """Q(s_t, a⁻) of the chunk that was sent."""
+    positives: Float[np.ndarray, "K H A"]
+    """Fewer than K, or none, where no more candidates passed the filter."""
+    q: Float[np.ndarray, "K"]
+    """Q(s_t, a⁺), the smaller of the twins."""
+    distance: Float[np.ndarray, "K"]
+    """d(a⁺, a⁻), action units."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,6 +260,10 @@ class Adaptation:
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall-clock seconds by stage."""
     note: str = ""
+    contrasts: tuple[Contrast, ...] = ()
+    """The flagged chunks' positives; empty in recordings made before they were kept, and for objectives without."""
+    corrections: tuple[FlagCorrection, ...] = ()
+    """The operator's words that had come in time for `flagged`."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -164,8 +164,16 @@ class Console:
         self._beats += 1
         self._beat.content = html.beat(self._beats, fresh)
 
-    def text(self, telemetry: Telemetry | None, view: View | None, fresh: Freshness, viewer: str | None) -> None:
-        """Words, buttons, tables; viser sends only what changed. `viewer` is where rerun shows the session."""
+    def text(
+        self,
+        telemetry: Telemetry | None,
+        view: View | None,
+        fresh: Freshness,
+        viewer: str | None,
+        why: str | None = None,
+    ) -> None:
+        """Words, buttons, tables; viser sends only what changed. `viewer` is where rerun shows the session, `why` its
+        attempt view."""
         status = view.status if view is not None and not fresh.hw_silent else None
         self._head.content = html.head(banner(telemetry, fresh), arm_word(status))
         latched = status is not None and status.mode is RobotMode.LATCHED
@@ -183,7 +191,7 @@ class Console:
             self._history.content = html.history(telemetry.history, summary(telemetry.history))
             self._events.content = html.events(telemetry.log, telemetry.stamp)
             refusal = refusal or telemetry.refusal
-        self._foot.content = html.foot(gauges, refusal, viewer, session)
+        self._foot.content = html.foot(gauges, refusal, viewer, session, why)
 
     def pictures(self, view: View) -> None:
         """The cameras' JPEGs as they came: no decoding and no encoding on the way to the browser."""

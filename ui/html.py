@@ -99,7 +99,7 @@ def events(lines: tuple[LogLine, ...], now: float) -> str:
     return f'<div class="far-card far-events" id="op-events"><h2>Events</h2><div class="far-scroll">{body}</div></div>'
 
 
-def foot(gauges: tuple[Gauge, ...], refusal: str, viewer: str | None, session: str) -> str:
+def foot(gauges: tuple[Gauge, ...], refusal: str, viewer: str | None, session: str, why: str | None = None) -> str:
     """Loop health along the bottom edge."""
     items = "".join(
         f'<span class="tone-{g.tone}"><i>{escape(g.label)}</i><b>{escape(g.value)}</b></span>' for g in gauges
@@ -109,6 +109,8 @@ def foot(gauges: tuple[Gauge, ...], refusal: str, viewer: str | None, session: s
         if viewer
         else '<a class="off">rerun off</a>'
     )
+    if why:
+        link = f'<a href="{escape(why)}" target="_blank" rel="noreferrer">why did it fail ↗</a>' + link
     said = f'<span class="far-refusal">{escape(refusal)}</span>' if refusal else ""
     items += said + f'<span class="far-session">{escape(session)}</span>' + link
     return f'<div class="far-foot" id="op-loop">{items}</div>'

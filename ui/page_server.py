@@ -10,6 +10,7 @@ import contextlib
 import io
 import ipaddress
 import logging
+import math
 import re
 import socket
 from collections.abc import Callable, Iterator
@@ -100,6 +101,7 @@ class Presses:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._actions: dict[str, Callable[[], None]] = {}
+        self._values: dict[str, tuple[viser.GuiSliderHandle[Any], Callable[[float], None]]] = {}
         wire = server._websock_server
         for kind in list(wire._incoming_handlers):
             wire.unregister_handler(kind)
@@ -109,7 +111,18 @@ class Presses:
     def on(self, handle: viser.GuiButtonHandle | viser.CommandHandle, action: Callable[[], None]) -> None:
         self._actions[handle._impl.uuid] = action
 
+    def on_value(self, handle: viser.GuiSliderHandle[Any], action: Callable[[float], None]) -> None:
+        """A slider; the action gets a finite number within its limits, whatever the client says."""
+        self._values[handle._impl.uuid] = (handle, action)
+
     def _click(self, _client: Any, message: messages.GuiUpdateMessage) -> None:
+        slider = self._values.get(message.uuid)
+        if slider is not None and set(message.updates) == {"value"}:
+            value = message.updates["value"]
+            if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+                handle, move = slider
+                move(float(min(max(value, handle.min), handle.max)))
+            return
         action = self._actions.get(message.uuid)
         if action is not None and message.updates == {"value": True}:
             action()

@@ -25,6 +25,7 @@ from far_app.telemetry import Telemetry
 from ui.console import Console
 from ui.feeds import Feeds
 from ui.live_viewer import LiveViewer
+from ui.live_why import LiveWhy
 from ui.page_server import open_page, page_url
 from ui.parent import die_with_parent
 from ui.presence import Presence
@@ -86,6 +87,7 @@ class Page:
             self._server, self._stop_line, self._latest, scene3d=options.scene3d, cameras=options.cameras
         )
         self._viewer = LiveViewer(options.run_folder, options.recordings) if options.rerun else None
+        self._why = LiveWhy(options.run_folder, options.recordings, options.operator)
         self._plots, self._texts, self._trails, self._beats = Every(1 / 5), Every(1 / 5), Every(1 / 5), Every(1 / 2)
         self._telling = Every(1 / 4)
         self._hw_seq = 0
@@ -109,8 +111,9 @@ class Page:
                 self._console.beat(fresh)
             if self._texts(now):
                 viewer = self._viewer.url if self._viewer is not None else None
-                self._console.text(telemetry, self._feeds.view.message, fresh, viewer)
+                self._console.text(telemetry, self._feeds.view.message, fresh, viewer, self._why.url)
             if telemetry is not None and heard:
+                self._why.follow(telemetry)
                 if self._plots(now):
                     self._console.plots.show(telemetry)
                 if self._console.scene is not None:
@@ -146,6 +149,7 @@ class Page:
                 log.warning("nobody takes the intent %s: is the app running?", intent.value)
 
     def close(self) -> None:
+        self._why.close()
         if self._viewer is not None:
             self._viewer.close()
         self._stop_line.close()

@@ -8,6 +8,7 @@ Only whole chunks (t + H ≤ T) are ranked. Pure numpy; the methods call it afte
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from jaxtyping import Float
 
 from far_app.config import AttributionConfig
 from far_app.errors import ConfigError
+from far_app.types import FlagCorrection
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,3 +51,12 @@ def flag(changes: Float[np.ndarray, "C"], config: AttributionConfig) -> Flags:
         "whole": lambda: float(changes[known].max()),
     }[config.rule]()
     return Flags(ticks=tuple(int(t) for t in np.flatnonzero(known & (changes <= threshold))), threshold=threshold)
+
+
+def corrected(ticks: Sequence[int], corrections: Sequence[FlagCorrection], chunks: int) -> tuple[int, ...]:
+    """The flagged ticks with the operator's words: the last on a tick counts; one on no whole chunk says nothing."""
+    flagged = set(ticks)
+    for correction in corrections:
+        if 0 <= correction.tick < chunks:
+            (flagged.add if correction.flagged else flagged.discard)(correction.tick)
+    return tuple(sorted(flagged))

@@ -47,6 +47,8 @@ class Pairs:
     """Flagged states whose filtered set was empty under [d_min, d_max], before the fallback."""
     dropped_states: int = 0
     """Flagged states left without a positive, and so without a pair."""
+    kept: tuple[int, ...] = ()
+    """Which of the flagged states, by their order, the S rows are; for the record."""
 
     def __len__(self) -> int:
         return len(self.positives)
@@ -133,7 +135,7 @@ def select(
     return Pairs(
         features=features[kept], negatives=negatives[kept], positives=chunks[chosen], owner=owner,
         weights=torch.ones(len(owner), device=chunks.device), empty_states=int(empty.sum()),
-        dropped_states=int((~kept).sum()),
+        dropped_states=int((~kept).sum()), kept=tuple(kept.nonzero().flatten().tolist()),
     )  # fmt: skip
 
 

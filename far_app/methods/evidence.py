@@ -12,12 +12,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from far_app.config import AttributionConfig
-from far_app.learning.attribution import flag, value_change
+from far_app.learning.attribution import corrected, flag, value_change
 from far_app.learning.cancellation import Cancelled, check
 from far_app.learning.critic import Critic
+from far_app.learning.pairs import Pairs, distance
 from far_app.learning.policy import DiffusionPolicy
 from far_app.protocols import History
-from far_app.types import Adaptation, Attempt
+from far_app.types import Adaptation, Attempt, Contrast
 
 HISTORIES_A_PASS = 4
 """Histories encoded between two looks at `cancelled`: a few ms for a light encoder, some 100 ms for ResNets."""
@@ -83,7 +84,28 @@ def attributed(
     found = values(policy, critic, attempt, cancelled)
     changes = value_change(found, policy.config.horizon)
     flags = flag(changes, config)
-    return replace(adaptation, values=found, value_changes=changes, threshold=flags.threshold, flagged=flags.ticks)
+    return replace(
+        adaptation, values=found, value_changes=changes, threshold=flags.threshold, corrections=attempt.corrections,
+        flagged=corrected(flags.ticks, attempt.corrections, len(changes)),
+    )  # fmt: skip
+
+
+def contrasts(
+    pairs: Pairs, ticks: Sequence[int], shown: Float[Tensor, "S F"], critic: Critic, arm_only: bool
+) -> tuple[Contrast, ...]:
+    """Each flagged chunk that has positives beside them, for people: Q and distance, best Q first."""
+    found = []
+    for row, state in enumerate(pairs.kept):
+        positives, negative = pairs.positives[pairs.owner == row], pairs.negatives[row : row + 1]
+        seen_here = shown[state : state + 1]
+        q = critic.q(seen_here.expand(len(positives), -1), positives)
+        order = q.argsort(descending=True)
+        apart = distance(positives[None], negative, arm_only)[0]
+        found.append(Contrast(
+            tick=int(ticks[state]), negative_q=float(critic.q(seen_here, negative)),
+            positives=positives[order].cpu().numpy(), q=q[order].cpu().numpy(), distance=apart[order].cpu().numpy(),
+        ))  # fmt: skip
+    return tuple(found)
 
 
 def sent_chunks(attempt: Attempt, ticks: Sequence[int], horizon: int) -> Float[np.ndarray, "S H A"]:

@@ -231,7 +231,9 @@ class _Learning:
             if config.explore > 0:
                 chunks = explored(chunks, config.explore, self._rng("exploration"))
             self.note("candidates")
-            return select(chunks, seen, negatives, critic.q, config, shown)
+            pairs = select(chunks, seen, negatives, critic.q, config, shown)
+            self.note(contrasts=evidence.contrasts(pairs, ticks, shown, critic, config.arm_only))
+            return pairs
 
     def _trajectory(self, critic: Critic) -> Pairs:
         """Every whole chunk of the attempt, weighted by its advantage (the awr objective)."""

@@ -196,6 +196,8 @@ LINES = {
     "adapted": "`detail.status`, `detail.base_version`, `detail.version`, `detail.flagged`, `detail.pairs`",
     "weights_kept": "`detail.file`, `detail.version`, `detail.parent`, `detail.bytes`: what the adaptation made",
     "outcome_marked": "someone's word on an attempt: `detail.success`, `detail.judged_by`, `detail.note`",
+    "flag_corrected": "the operator's word on a chunk: `detail.trial`, `detail.attempt`, `detail.tick`, "
+    "`detail.flagged`, `detail.by`, `detail.used` (it came in time for the adaptation)",
     "trial_ended": "`detail.success`, `detail.attempts`",
     "recording_failed": "the writer gave up; `text` says why",
     "recorder_late": "the writer was more than 1 s behind the loop; `detail.seconds`",

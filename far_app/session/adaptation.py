@@ -11,7 +11,7 @@ import numpy as np
 
 from far_app.protocols import Method
 from far_app.scheduling import BACKGROUND_NICENESS, nice
-from far_app.types import Adaptation, AdaptationStep, Attempt
+from far_app.types import Adaptation, AdaptationStep, Attempt, FlagCorrection
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +32,10 @@ class BackgroundAdaptation:
         self._cancelled = threading.Event()
         self._why = "cancelled"
         self._adaptation: Adaptation | None = None
+        self._words: list[FlagCorrection] = []
+        self._late = False
+        """Too late for another word of the operator's."""
+        self._lock = threading.Lock()
         self._thread = threading.Thread(target=self._work, args=(method, attempt), name="adaptation", daemon=True)
         self._thread.start()
 
@@ -40,6 +44,15 @@ class BackgroundAdaptation:
         self._cancelled.set()
         if wait:
             self._thread.join()
+
+    def correct(self, word: FlagCorrection) -> bool:
+        """The operator's word on a chunk: learn anew with it; False when it comes too late. The result's `corrections`
+        tell which words counted."""
+        with self._lock:
+            if self._late or self._cancelled.is_set():
+                return False
+            self._words.append(word)
+            return True
 
     @property
     def running(self) -> bool:
@@ -65,11 +78,27 @@ class BackgroundAdaptation:
     def _work(self, method: Method, attempt: Attempt) -> None:
         nice(BACKGROUND_NICENESS)
         try:
-            self._adaptation = method.adapt(attempt, self._cancelled.is_set, self._hear)
+            self._adaptation = self._learn(method, attempt)
         except Exception as error:
             log.exception("the adaptation failed; the previous policy version retries")
             self._adaptation = unchanged(self._base_version, "failed", f"{type(error).__name__}: {error}")
         self.known = self._adaptation
+
+    def _learn(self, method: Method, attempt: Attempt) -> Adaptation:
+        """Until no word of the operator's came in between."""
+        while True:
+            words = tuple(self._words)
+
+            def superseded(known: int = len(words)) -> bool:
+                return self._cancelled.is_set() or len(self._words) > known
+
+            adaptation = method.adapt(dataclasses.replace(attempt, corrections=words), superseded, self._hear)
+            with self._lock:
+                again = adaptation.status == "cancelled" and len(self._words) > len(words)
+                if self._cancelled.is_set() or not again:
+                    self._late = True
+                    return adaptation
+            self.progress = []
 
     def _hear(self, news: AdaptationStep | Adaptation) -> None:
         if isinstance(news, Adaptation):

@@ -11,6 +11,7 @@ import zmq
 
 from far_app.session_states import Intent
 from far_app.telemetry import OperatorIntent, PagePresence
+from far_app.what_if import CorrectFlag
 from far_app.wire import WireError, unpack
 
 log = logging.getLogger(__name__)
@@ -21,6 +22,7 @@ class IntentInbox:
 
     def __init__(self, endpoint: str | None = None) -> None:
         self._queue: queue.SimpleQueue[Intent] = queue.SimpleQueue()
+        self._words: queue.SimpleQueue[CorrectFlag] = queue.SimpleQueue()
         self.looked_at = time.monotonic()
         """When somebody was last known to have the page open."""
         self._closing = threading.Event()
@@ -42,6 +44,13 @@ class IntentInbox:
             intents.append(self._queue.get_nowait())
         return intents
 
+    def words(self) -> list[CorrectFlag]:
+        """The operator's words on chunks since the last call, oldest first; never waits."""
+        words = []
+        while not self._words.empty():
+            words.append(self._words.get_nowait())
+        return words
+
     def close(self) -> None:
         self._closing.set()
         if self._thread is not None:
@@ -60,5 +69,7 @@ class IntentInbox:
             if isinstance(message, OperatorIntent):
                 log.info("operator: %s", message.intent)
                 self._queue.put(message.intent)
+            elif isinstance(message, CorrectFlag):
+                self._words.put(message)
             elif isinstance(message, PagePresence) and message.clients > 0:
                 self.looked_at = time.monotonic()

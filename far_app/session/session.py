@@ -45,6 +45,7 @@ from far_app.trial import (
     trial,
 )
 from far_app.types import Adaptation, Attempt, Step, Trial
+from far_app.what_if import CorrectFlag
 
 log = logging.getLogger(__name__)
 
@@ -326,13 +327,32 @@ class Session:
         for chunk in self.planner.handed_out():
             self.board.planned(chunk)
             self.recorder.add_chunk(chunk)
+        for asked in self.supervision.inbox.words():
+            self._correct(asked)
         if self._adaptation is not None:
             self.board.attributed(self._adaptation.known)
+            self._reported = min(self._reported, len(self._adaptation.progress))  # it may have begun anew
         if self._adaptation is not None and len(self._adaptation.progress) > self._reported:
             steps = tuple(self._adaptation.progress)
             for step in steps[self._reported :]:
                 self.recorder.add_adaptation_step(step)
             self.board.adaptation_steps, self._reported = steps, len(steps)
+
+    def _correct(self, asked: CorrectFlag) -> None:
+        """The operator's word on a chunk: kept, and used when its attempt is the one being learnt from."""
+        if asked.session != self.settings.name:
+            return self.supervision.say(f"a correction for session '{asked.session}' is not kept here", "warning")
+        here = (asked.trial, asked.attempt) == (self.board.trial, self.board.attempt)
+        word, running = asked.correction, self._adaptation
+        used = here and self.board.adapting and running is not None and running.correct(word)
+        detail = {
+            "trial": asked.trial, "attempt": asked.attempt, "tick": word.tick, "flagged": word.flagged, "by": word.by,
+            "used": used,
+        }  # fmt: skip
+        self.recorder.event("flag_corrected", "", detail)
+        then = "the adaptation begins anew with it" if used else "kept; too late for an adaptation"
+        what = "flagged" if word.flagged else "unflagged"
+        return self.supervision.say(f"chunk {word.tick} of attempt {asked.attempt} {what} by {word.by}: {then}")
 
     def _adapted(self, adaptation: Adaptation) -> None:
         self._report()

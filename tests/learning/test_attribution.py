@@ -10,7 +10,8 @@ from hypothesis.extra.numpy import arrays
 
 from far_app.config import AttributionConfig
 from far_app.errors import ConfigError
-from far_app.learning.attribution import flag, value_change
+from far_app.learning.attribution import corrected, flag, value_change
+from far_app.types import FlagCorrection
 
 VALUES = arrays(np.float64, st.integers(10, 60), elements=st.floats(-50, 0, allow_nan=False))
 
@@ -74,3 +75,10 @@ def test_an_unknown_value_is_never_flagged():
 def test_threshold_without_a_number_says_what_to_set():
     with pytest.raises(ConfigError, match="set it to a value change"):
         flag(np.zeros(3), AttributionConfig(rule="threshold"))
+
+
+def test_the_operators_last_word_on_a_chunk_overrides_its_value_change():
+    words = tuple(
+        FlagCorrection(tick=t, flagged=f) for t, f in ((1, False), (4, True), (2, False), (2, True), (9, True))
+    )
+    assert corrected((1, 2), words, chunks=6) == (2, 4)

@@ -1,0 +1,114 @@
+"""`far replay` on the sample session in a real headless Chromium: stepping, what-if, correcting, adapting again."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ui_process import free_port, wait_until
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright (the dev extra)")
+CHROMIUM = Path("/usr/bin/chromium")
+ROOT = Path(__file__).resolve().parents[2]
+ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader"]
+ARGUMENTS += ["--enable-unsafe-swiftshader"]
+FLAGGED = (20, 21, 35, 36, 37, 38, 39, 43, 44, 45, 46, 47, 48, 49, 50)
+SETTLED = 60_000
+
+pytestmark = [
+    pytest.mark.page,
+    pytest.mark.slow,
+    pytest.mark.skipif(not CHROMIUM.exists(), reason="no /usr/bin/chromium: apt-get install chromium"),
+]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return Path(shutil.copytree(ROOT / "recordings/sample", tmp_path_factory.mktemp("replay") / "session"))
+
+
+@pytest.fixture(scope="module")
+def page(session: Path) -> Iterator[Any]:
+    port = free_port()
+    code = "import sys; from far_app.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, "replay", str(session), "--port", str(port), "--operator", "ada"]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None and str(port) in process.stdout.readline()
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=str(CHROMIUM), args=ARGUMENTS)
+        tab = chromium.new_page(viewport={"width": 1280, "height": 720})
+        tab.requests = []
+        tab.on("request", lambda request: tab.requests.append(request.url))
+        tab.goto(f"http://127.0.0.1:{port}")
+        tab.wait_for_selector("#why-state[data-outcome='FAILURE'][data-tick='50']", timeout=SETTLED)
+        yield tab
+        assert all(url.startswith((f"http://127.0.0.1:{port}", "data:", "blob:")) for url in tab.requests)
+        chromium.close()
+    process.terminate()
+    assert process.wait(timeout=20) == 0
+    process.stdout.close()
+
+
+def at(page: Any, tick: int) -> None:
+    page.wait_for_selector(f"#why-state[data-tick='{tick}']", timeout=SETTLED)
+
+
+def test_stepping_shows_each_flagged_chunk_with_frames_at_its_start_and_end(page: Any) -> None:
+    for tick in FLAGGED[:3]:
+        page.keyboard.press("n")
+        at(page, tick)
+        page.wait_for_selector(f"#why-frames figure[data-camera='front'][data-tick='{tick}'] img")
+        page.wait_for_selector(f"#why-frames figure[data-camera='wrist'][data-tick='{tick + 8}'] img")
+        assert f"Chunk {tick} – {tick + 7}" in page.inner_text("#why-numbers")
+        assert page.get_attribute("#why-numbers", "data-flagged") == "1"
+    page.get_by_role("button", name="◀ Flagged").click()
+    at(page, FLAGGED[1])
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("ArrowLeft")
+    at(page, FLAGGED[1] - 2)
+    assert page.get_attribute("#why-numbers", "data-flagged") == "0"
+    page.keyboard.press("n")
+    at(page, FLAGGED[0])
+
+
+def test_the_better_chunks_are_drawn_and_ranked_by_q(page: Any) -> None:
+    page.wait_for_selector("#why-numbers tr.sent", timeout=SETTLED)
+    gains = [float(cell) for cell in page.locator("#why-numbers tr:not(.sent) td:nth-child(3)").all_inner_texts()]
+    assert 1 <= len(gains) <= 8 and gains == sorted(gains, reverse=True)
+
+
+def test_another_rho_changes_the_flagged_set_at_once_and_as_recorded_takes_it_back(page: Any) -> None:
+    box = page.locator(".slot-rho").locator("xpath=../following-sibling::div[1]").locator("input:visible").last
+    box.fill("20")
+    box.press("Enter")
+    page.wait_for_selector("#why-state[data-flagged='29']", timeout=SETTLED)
+    assert "what if: ρ 20 %" in page.inner_text("#why-state")
+    page.get_by_role("button", name="As recorded").click()
+    page.wait_for_selector("#why-state[data-flagged='15']", timeout=SETTLED)
+
+
+def test_the_operators_word_is_kept_beside_the_recording(page: Any, session: Path) -> None:
+    page.evaluate("document.activeElement.blur()")
+    tick = int(page.get_attribute("#why-state", "data-tick"))
+    page.keyboard.press("f")
+    page.wait_for_selector("#why-state[data-flagged='14']", timeout=SETTLED)
+    assert "by ada" in page.inner_text("#why-numbers")
+    lines = (session / "corrections.jsonl").read_text().splitlines()
+    assert json.loads(lines[-1])["detail"] == {
+        "trial": 1, "attempt": 1, "tick": tick, "flagged": False, "by": "ada", "used": False,
+    }  # fmt: skip
+    page.get_by_role("button", name="Flag to blame").click()
+    page.wait_for_selector("#why-state[data-flagged='15']", timeout=SETTLED)
+    assert wait_until(lambda: len((session / "corrections.jsonl").read_text().splitlines()) == 2)
+
+
+def test_adapting_again_shows_both_losses_and_what_moved(page: Any) -> None:
+    page.keyboard.press("g")
+    page.wait_for_selector("#why-lesson[data-steps='11'][data-stage='']", timeout=2 * SETTLED)
+    assert "l⁺" in page.inner_text("#why-lesson") and "mm" in page.inner_text("#why-lesson")
