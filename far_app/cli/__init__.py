@@ -20,7 +20,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "improve": ("far_app.cli.improve", "collect with retries, learn from successes and failures, again and again"),
     "report": ("far_app.cli.report", "tables with intervals and tests, and a picture, of a folder of results"),
     "inspect": ("far_app.cli.inspect", "what a recorded session holds, and what is missing or damaged"),
-    "replay": ("far_app.cli.replay", "open a recorded attempt or session in the rerun viewer"),
+    "replay": ("far_app.cli.replay", "why did it fail: a recorded session in the attempt view, or in rerun"),
     "bench loop": ("far_app.bench.loop", "lateness of the 30 Hz loop, idle and adapting"),
     "bench infer": ("far_app.bench.infer", "milliseconds per chunk, by preset"),
     "bench adapt": ("far_app.bench.adapt", "seconds from a failed attempt to a new policy version, by stage"),
