@@ -13,6 +13,7 @@ from far_app.recording.corrections import now as wall_clock
 from far_app.types import FlagCorrection
 from far_app.what_if import RECORDED, CorrectFlag
 from ui.page_server import open_page, page_url
+from ui.presence import Presence
 from ui.why_asking import Asking
 from ui.why_link import Link
 from ui.why_model import Attribution, Case, attribution, deepest
@@ -41,7 +42,7 @@ class View:
     def __init__(self, options: WhyOptions) -> None:
         self._options = options
         self._sitting = Sitting(options.session)
-        server = open_page(options.host, options.port)
+        server = open_page(options.host, options.port, Presence())
         self.url = page_url(options.host, server.get_port())
         self._server = server
         self._page = WhyPage(server, scene3d=options.scene3d)

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import json
 import threading
 
 import numpy as np
@@ -16,6 +17,8 @@ from far_app.learning.runtime import ActingPolicy
 from far_app.methods import METHODS, Ingredients, method
 from far_app.methods.evidence import history, sent_chunks
 from far_app.protocols import Method
+from far_app.recording.codec import codec, decode
+from far_app.types import Adaptation, FlagCorrection
 from tests.learning.small import small_attempt, small_critic, small_policy
 
 QUICK = RetryConfig(
@@ -89,6 +92,28 @@ def test_an_adaptation_reports_its_evidence():
     assert (paired.flagged, paired.pairs) == (adaptation.flagged, 12)
     assert tuple(steps) == adaptation.history
     assert set(adaptation.seconds) == {"attribution", "encoding", "candidates", "pairs", "update"}
+
+
+def test_an_adaptation_keeps_its_positives_best_first_within_a_recording():
+    m = made("far")
+    m.begin(5)
+    adaptation = adapt(m, small_attempt(ticks=40))
+    assert tuple(c.tick for c in adaptation.contrasts) == adaptation.flagged
+    assert sum(len(c.positives) for c in adaptation.contrasts) == adaptation.pairs
+    assert all((np.diff(c.q) <= 0).all() and (c.distance > 0).all() for c in adaptation.contrasts)
+    again = decode(Adaptation, json.loads(json.dumps(codec(Adaptation).encode(adaptation))), "a round trip")
+    assert np.array_equal(again.contrasts[0].positives, adaptation.contrasts[0].positives)
+
+
+def test_the_operators_words_decide_what_is_learnt_from():
+    m = made("far")
+    m.begin(5)
+    attempt = small_attempt(ticks=40)
+    flagged = adapt(made("far"), attempt).flagged
+    words = (FlagCorrection(tick=flagged[0], flagged=False), FlagCorrection(tick=30, flagged=True))
+    adaptation = adapt(m, dataclasses.replace(attempt, corrections=words))
+    assert set(adaptation.flagged) == (set(flagged) - {flagged[0]}) | {30}
+    assert adaptation.corrections == words
 
 
 def test_missing_values_are_computed_from_the_critic():
