@@ -26,15 +26,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "tables and a picture of results, or a page on recorded sessions",
     ),
     "inspect": ("far_app.cli.inspect", "what a recorded session holds, and what is missing or damaged"),
-<<<<<<< HEAD
-    "replay": ("far_app.cli.replay", "open a recorded attempt or session in the rerun viewer"),
+    "replay": ("far_app.cli.replay", "why did it fail: a recorded session in the attempt view, or in rerun"),
     "export": ("far_app.cli.export", "recorded attempts as a LeRobot, robomimic or rerun dataset"),
     "import": ("far_app.cli.import_demos", "robomimic or LeRobot demonstrations as ours"),
     "policy list": ("far_app.cli.policy_list", "the adapted policy versions a session kept, and their lineage"),
     "policy promote": ("far_app.cli.policy_promote", "an adapted version as a checkpoint of its own"),
-=======
-    "replay": ("far_app.cli.replay", "why did it fail: a recorded session in the attempt view, or in rerun"),
->>>>>>> why
     "bench loop": ("far_app.bench.loop", "lateness of the 30 Hz loop, idle and adapting"),
     "bench infer": ("far_app.bench.infer", "milliseconds per chunk, by preset"),
     "bench adapt": ("far_app.bench.adapt", "seconds from a failed attempt to a new policy version, by stage"),
