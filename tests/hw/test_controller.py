@@ -84,13 +84,29 @@ def test_the_watchdog_triggers_at_100_ms_and_the_command_stands_still_by_150(ser
     arm.stream(5)
     arm.target()
     last = arm.now
-    while arm.mode is RobotMode.TRACKING:
+    while arm.mode is RobotMode.TRACKING and arm.now - last < 1.0:
         arm.tick()
     assert 0.1 <= arm.now - last <= 0.1 + 2 / servo_hz
     while arm.speed() > 0:
         arm.tick()
     assert arm.now - last <= 0.150
     assert arm.controller.status().holds == 1
+
+
+def test_an_arm_whose_report_is_older_than_100_ms_is_held_and_takes_no_target() -> None:
+    arm = Arm()
+    arm.stream(5)
+    arm.measured = replace(arm.measured, age=0.09)
+    assert not arm.target()
+    arm.tick()
+    assert arm.mode is RobotMode.TRACKING
+    arm.measured = replace(arm.measured, age=0.11)
+    arm.tick()
+    assert arm.mode is RobotMode.HOLD and "last report is 110 ms old" in arm.controller.status().reason
+    assert "last report is 110 ms old" in arm.target()
+    arm.measured = replace(arm.measured, age=0.0)
+    arm.tick()
+    assert not arm.target(), "and goes on with the next report"
 
 
 def test_a_stop_at_full_speed_stands_still_within_50_ms() -> None:
