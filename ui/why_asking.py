@@ -23,7 +23,7 @@ class Asking:
 
     def __init__(self, link: Link) -> None:
         self._link = link
-        self._number = itertools.count(1 + int(time.time()) % 1_000_000)
+        self._number = itertools.count(1 + int(time.monotonic()) % 1_000_000)
         self._wish: tuple[object, ...] = ()
         self._wished = self._spoke = 0.0
         self._open: Question | None = None

@@ -99,7 +99,7 @@ def running(options: FaultOptions, recordings: Path) -> Iterator[Bench]:
     hasten(fake)
     run = RunOptions(
         robot="xarm", host=f"{options.address}:{PORT}", policy=options.policy, headless=True, rerun=False,
-        recordings=recordings, max_attempts=1_000_000, full_speed=True,
+        judge_wait=0.0, recordings=recordings, max_attempts=1_000_000, full_speed=True,
     )  # fmt: skip
     try:
         with stage(run) as made:

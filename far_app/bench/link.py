@@ -119,7 +119,7 @@ class Run:
 def running(other: RobotPC, recordings: Path) -> Iterator[Run]:
     run = RunOptions(
         robot="xarm", hw=other.address, keys=other.keys, policy="test:wander", headless=True, rerun=False,
-        recordings=recordings, max_attempts=1_000_000, full_speed=True,
+        judge_wait=0.0, recordings=recordings, max_attempts=1_000_000, full_speed=True,
     )  # fmt: skip
     with stage(run) as made:
         attended = dataclasses.replace(made, options=dataclasses.replace(run, headless=False))
