@@ -60,6 +60,7 @@ class Run:
     def press(self, label: str) -> None:
         uuid = self.page.find(label)
         assert uuid is not None, label
+        assert self.page.read(5.0, lambda: not self.page.widgets[uuid].get("disabled")), f"{label} stays disabled"
         self.page.press(uuid)
 
     def close(self) -> tuple[int, str]:
