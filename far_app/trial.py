@@ -152,6 +152,7 @@ def execute(
 
     Stretched, each of the policy's ticks takes so many of the robot's: the same way and the same horizon, slower."""
     spec = method.policy.spec
+    shares = np.array((stretch,) * ARM_DIMS + (1,))  # the gripper is told the whole of its action in every part
     plan = Plan(horizon=spec.horizon)
     perturbation = method.perturb(index, scene_seed)
     history: deque[Observation] = deque(maxlen=spec.n_obs)
@@ -167,7 +168,7 @@ def execute(
         assert isinstance(deadline, float), "a Tick is answered with its deadline"
         observation = robot.observe()
         if step is not None:
-            steps.append(completed(step, observation, integrator, stretch))
+            steps.append(completed(step, observation, integrator, shares))
         if isinstance(deadline, AfterHold):
             plan, integrator = Plan(horizon=spec.horizon), TargetIntegrator(scale, observation.eef)
             history.clear()
@@ -183,17 +184,18 @@ def execute(
         action = plan.action(t)  # â_t = g(chunks)
         delta = perturbation(t) if action is not None else np.zeros(ACTION_DIM)  # δ_t
         commanded = np.clip(action + delta, -1.0, 1.0) if action is not None else hold_still(steps)
-        part = commanded / np.array((stretch,) * ARM_DIMS + (1,))
+        part, here = commanded / shares, observation
         for _ in range(stretch - 1):
-            robot.send(integrator.target(part, robot.observe().eef, deadline))
+            robot.send(integrator.target(part, here.eef, deadline))
             deadline = yield Tick(phase="attempt", attempt_index=index, between=True)
             assert isinstance(deadline, float), "a Tick is answered with its deadline"
-            for ack in robot.observe().acks:
+            here = robot.observe()
+            for ack in here.acks:
                 integrator.executed(ack)
             if isinstance(deadline, AfterHold):
-                plan, integrator = Plan(horizon=spec.horizon), TargetIntegrator(scale, robot.observe().eef)
+                plan, integrator = Plan(horizon=spec.horizon), TargetIntegrator(scale, here.eef)
                 history.clear()
-        target = integrator.target(part, robot.observe().eef, deadline)
+        target = integrator.target(part, here.eef, deadline)
         robot.send(target)
         step = Step(
             tick=t, seq=target.seq, stamp=observation.stamp, deadline=deadline, observation=observation,
@@ -242,13 +244,12 @@ def go_home(
             return
 
 
-def completed(step: Step, observation: Observation, integrator: TargetIntegrator, stretch: int) -> Step:
-    """The step with what was sent and how late, once its target (the last of its `stretch` parts) is acknowledged."""
+def completed(step: Step, observation: Observation, integrator: TargetIntegrator, shares: np.ndarray) -> Step:
+    """The step with what was sent and how late, once its target (the last of its parts) is acknowledged."""
     for ack in observation.acks:
         executed = integrator.executed(ack)
         if ack.seq == step.seq:
-            sent = executed if executed is not None else step.sent
-            sent = sent * np.array((stretch,) * ARM_DIMS + (1,))
+            sent = shares * (executed if executed is not None else step.sent)
             return replace(step, sent=sent, lateness=ack.accepted - ack.due)
     return step
 

@@ -138,9 +138,8 @@ def test_the_death_of_the_app_holds_the_arm_and_leaves_a_readable_recording(fake
     assert found.trials[0].attempts[0].steps > 10
 
 
-@pytest.mark.slow
-def test_stop_from_the_page_reaches_the_controller_while_the_app_is_frozen(fake: FakeXArm, tmp_path: Path) -> None:
-    run = Run(fake, tmp_path, "--full-speed")
+def stop_while_the_app_is_frozen(run: Run, fake: FakeXArm) -> None:
+    """STOP pressed then stops the arm, and is told and left by Resume when the app goes on."""
     try:
         run.shows("Rebuild the scene")
         run.press("Scene ready")
@@ -160,3 +159,8 @@ def test_stop_from_the_page_reaches_the_controller_while_the_app_is_frozen(fake:
         run.process.send_signal(signal.SIGCONT)
         code, err = run.close()
     assert code == 0, err
+
+
+@pytest.mark.slow
+def test_stop_from_the_page_reaches_the_controller_while_the_app_is_frozen(fake: FakeXArm, tmp_path: Path) -> None:
+    stop_while_the_app_is_frozen(Run(fake, tmp_path, "--full-speed"), fake)

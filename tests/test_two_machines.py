@@ -6,7 +6,6 @@ import dataclasses
 import json
 import math
 import os
-import signal
 import stat
 import subprocess
 import sys
@@ -37,7 +36,7 @@ from hw.fake_xarm.control import FakeXArm
 from hw.rig import load_rig
 from tests.hw.conftest import FAKE_PORT, loopback
 from tests.recording.values import pose
-from tests.test_real_arm import STEP, Run, eventually, moves
+from tests.test_real_arm import STEP, Run, stop_while_the_app_is_frozen
 
 PORT = 20_000 + os.getpid() % 20_000
 
@@ -318,24 +317,7 @@ def test_stop_from_the_page_reaches_the_other_machine_while_the_app_is_frozen(
     controller: FakeXArm, address: str, keys: Path, tmp_path: Path
 ):
     run = Run(controller, tmp_path, "--full-speed", server=("--hw", address, "--keys", str(keys)))
-    try:
-        run.shows("Rebuild the scene")
-        run.press("Scene ready")
-        run.shows("begins in 3 s: Pause or STOP cancels")
-        eventually(lambda: moves(controller) > 0.5)
-        run.process.send_signal(signal.SIGSTOP)
-        eventually(lambda: moves(controller) == 0.0)
-        run.press("STOP")
-        time.sleep(0.5)
-        assert controller.state()["state"] == 4
-        run.process.send_signal(signal.SIGCONT)
-        run.shows("STOPPED", "arm latched")
-        run.press("Resume")
-        run.shows("begins in 3 s: Pause or STOP cancels")
-    finally:
-        run.process.send_signal(signal.SIGCONT)
-        code, err = run.close()
-    assert code == 0, err
+    stop_while_the_app_is_frozen(run, controller)
 
 
 @pytest.mark.slow

@@ -1,12 +1,22 @@
-"""No process of the page outlives the one that started it."""
+"""How a process of the page runs: to its parent's end and no longer, or until it is told."""
 
 from __future__ import annotations
 
 import ctypes
+import logging
 import os
 import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+from far_app.errors import FarError
+
+log = logging.getLogger(__name__)
+
+Options = TypeVar("Options")
+"""What a process was told."""
 
 PR_SET_PDEATHSIG = 1
 
@@ -17,6 +27,23 @@ def die_with_parent(number: signal.Signals = signal.SIGTERM) -> Callable[[], boo
     parent = os.getppid()
     _LIBC.prctl(PR_SET_PDEATHSIG, number) if _LIBC is not None else None
     return lambda: os.getppid() != parent
+
+
+def run_until_told(
+    parse: Callable[[Sequence[str] | None], Options], serve: Callable[[Options, threading.Event], None],
+    arguments: Sequence[str] | None,
+) -> int:  # fmt: skip
+    """The main of such a process: `serve` what was parsed until SIGTERM or SIGINT; 2 on a FarError, said in the log."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
+    options, ended = parse(arguments), threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: ended.set())
+    try:
+        serve(options, ended)
+    except FarError as error:
+        log.error("%s", error)
+        return 2
+    return 0
 
 
 def killed_with_parent() -> None:

@@ -10,7 +10,6 @@ import argparse
 import gc
 import logging
 import queue
-import signal
 import sys
 import threading
 import time
@@ -19,7 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from far_app.endpoints import Endpoints
-from far_app.errors import FarError
 from far_app.session_states import Intent
 from far_app.telemetry import Telemetry
 from ui.console import Console
@@ -27,7 +25,7 @@ from ui.feeds import Feeds
 from ui.live_viewer import LiveViewer
 from ui.live_why import LiveWhy
 from ui.page_server import open_page, page_url
-from ui.parent import die_with_parent
+from ui.parent import die_with_parent, run_until_told
 from ui.presence import Presence
 from ui.stop import StopLine, hasten
 from ui.view_model import Freshness
@@ -187,17 +185,7 @@ def parse(arguments: Sequence[str] | None) -> PageOptions:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
-    options = parse(arguments)
-    ended = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: ended.set())
-    try:
-        serve(options, ended)
-    except FarError as error:
-        log.error("%s", error)
-        return 2
-    return 0
+    return run_until_told(parse, serve, arguments)
 
 
 if __name__ == "__main__":

@@ -10,14 +10,12 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import signal
 import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from far_app.errors import FarError
-from ui.parent import die_with_parent
+from ui.parent import die_with_parent, run_until_told
 from ui.why_view import View, WhyOptions
 
 log = logging.getLogger(__name__)
@@ -48,17 +46,7 @@ def parse(arguments: Sequence[str] | None) -> WhyOptions:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
-    options = parse(arguments)
-    ended = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: ended.set())
-    try:
-        serve(options, ended)
-    except FarError as error:
-        log.error("%s", error)
-        return 2
-    return 0
+    return run_until_told(parse, serve, arguments)
 
 
 if __name__ == "__main__":

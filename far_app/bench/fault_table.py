@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from far_app.bench.waiting import came_true
 from far_app.cli.stage import Stage
 from far_app.scheduling import MESSAGE_PRIORITY
 from far_app.session.inbox import IntentInbox
@@ -47,19 +48,11 @@ class Bench:
     def state(self) -> State:
         return self.session.supervision.state
 
-    def wait(self, what: Callable[[], bool], seconds: float) -> bool:
-        deadline = time.monotonic() + seconds
-        while not what():
-            if time.monotonic() > deadline:
-                return False
-            time.sleep(0.005)
-        return True
-
     def stop(self) -> None:
         """STOP as the page sends it: straight to the hw server."""
         line = StopLine(self.stage.robot.endpoints)
         line.press("bench")
-        self.wait(lambda: line.result is not None and bool(line.result.latched), 1.0)
+        came_true(lambda: line.result is not None and bool(line.result.latched), 1.0)
         line.close()
 
     def starve(self) -> None:

@@ -24,6 +24,7 @@ import tyro
 from far_app.bench.fault_table import FAULTS, Bench, Fault, hasten
 from far_app.bench.report import keep, write
 from far_app.bench.servo_trace import servo_trace
+from far_app.bench.waiting import came_true
 from far_app.bench.whole_runs import WHOLE_RUNS, whole_runs
 from far_app.cli.options import RunOptions
 from far_app.cli.stage import stage
@@ -81,7 +82,7 @@ def measure(options: FaultOptions, names: list[str]) -> dict[str, Any]:
             rows[name] = row([once(bench, FAULTS[name]) for _ in range(options.repeats)])
             keep({"repeats": options.repeats, "faults": rows}, options.json)
         bench.inbox.put(Intent.QUIT)
-        bench.wait(lambda: bench.state is State.FINISHED, 10.0)
+        came_true(lambda: bench.state is State.FINISHED, 10.0)
         time.sleep(1.0)
         (folder,) = Path(recordings).iterdir()
         found = inspect_session(folder)
@@ -117,14 +118,14 @@ def running(options: FaultOptions, recordings: Path) -> Iterator[Bench]:
 
 def once(bench: Bench, fault: Fault) -> dict[str, Any]:
     """One strike in the middle of a motion, and the way out of it."""
-    moving = bench.wait(lambda: bench.state is State.RUNNING and bench.session._recorded > 15, 20.0)
+    moving = came_true(lambda: bench.state is State.RUNNING and bench.session._recorded > 15, 20.0)
     if not moving:
         raise FarError(f"the arm does not move: {bench.state}, {bench.session.board.reason}")
     bench.fake.received()
     bench.struck = time.monotonic()
     fault.strike(bench)
     struck = bench.struck
-    noticed = not fault.latches or bench.wait(lambda: bench.state in (State.FAULT, State.STOPPED), PATIENCE)
+    noticed = not fault.latches or came_true(lambda: bench.state in (State.FAULT, State.STOPPED), PATIENCE)
     noticed_after = time.monotonic() - struck
     words = bench.session.board.reason
     time.sleep(0.3 if fault.latches else fault.seconds)
@@ -150,8 +151,8 @@ def resume(bench: Bench) -> dict[str, Any]:
     deadline = time.monotonic() + PATIENCE
     while bench.state in (State.FAULT, State.STOPPED) and time.monotonic() < deadline:
         bench.inbox.put(Intent.RESUME)
-        bench.wait(lambda: bench.state not in (State.FAULT, State.STOPPED), 2.0)
-    bench.wait(lambda: bench.state is State.RUNNING, PATIENCE)
+        came_true(lambda: bench.state not in (State.FAULT, State.STOPPED), 2.0)
+    came_true(lambda: bench.state is State.RUNNING, PATIENCE)
     trace = servo_trace(bench.fake.servo_targets(), bench.stage.rig.safety)
     return {
         "resumed": bench.state is State.RUNNING, "first_mm": float(np.linalg.norm(trace.first - stood)),

@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ import tyro
 from far_app.bench.machines import AHEAD, FAR, RobotPC, robot_pc, separable
 from far_app.bench.report import write
 from far_app.bench.servo_trace import ServoTrace, servo_trace
+from far_app.bench.waiting import came_true
 from far_app.cli.options import RunOptions
 from far_app.cli.stage import Stage, stage
 from far_app.errors import FarError
@@ -91,14 +92,6 @@ class Run:
         newest = self.session.robot.newest
         return newest.status.holds if newest is not None else 0
 
-    def wait(self, what: Callable[[], bool], seconds: float = PATIENCE) -> bool:
-        deadline = time.monotonic() + seconds
-        while not what():
-            if time.monotonic() > deadline:
-                return False
-            time.sleep(0.005)
-        return True
-
     def trace(self) -> ServoTrace:
         """Of what the controller received since last asked."""
         return servo_trace(self.other.fake.servo_targets(), self.stage.rig.safety)
@@ -111,7 +104,7 @@ class Run:
                 raise FarError(f"the arm does not move: {self.state}, {self.session.board.reason}")
             if self.state in (State.FAULT, State.STOPPED):
                 self.inbox.put(Intent.RESUME)
-                self.wait(lambda: self.state not in (State.FAULT, State.STOPPED), 2.0)
+                came_true(lambda: self.state not in (State.FAULT, State.STOPPED), 2.0)
             time.sleep(0.01)
 
 
@@ -186,7 +179,7 @@ def cut(run: Run) -> dict[str, Any]:
     run.other.fake.received()
     pulled = time.monotonic()
     run.other.tell("cut")
-    told = run.wait(lambda: run.state is State.FAULT)
+    told = came_true(lambda: run.state is State.FAULT, PATIENCE)
     told_after, words = time.monotonic() - pulled, run.session.board.reason
     time.sleep(1.0)
     before = run.trace()
@@ -214,7 +207,7 @@ def stops(run: Run, times: int) -> dict[str, Any]:
         run.other.fake.received()
         pressed = time.monotonic()
         line.press("bench")
-        run.wait(lambda: run.state is State.STOPPED)
+        came_true(lambda: run.state is State.STOPPED, PATIENCE)
         time.sleep(0.1)
         heard = [
             r["at"] for r in run.other.fake.received()
