@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import sys
 import threading
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ log = logging.getLogger(__name__)
 
 
 def serve(options: WhyOptions, ended: threading.Event) -> None:
+    os.nice(5)  # beside a live run it gives way to the loop, the learning and the operator's page
     orphaned = die_with_parent()
     view = View(options)
     log.info("the attempt view is at %s", view.url)
