@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -50,8 +51,16 @@ class Run:
 
     def shows(self, *words: str, seconds: float = 20.0) -> None:
         """The page comes to show all of these words."""
-        if not self.page.read(seconds, lambda: all(w in self.text() for w in words)):
-            raise AssertionError(f"the page never showed {words}; it shows: {self.text()[-3000:]}")
+        refused: list[str] = []
+
+        def shown() -> bool:
+            text = self.text()
+            refused.extend(re.findall(r"\w[\w ]* refused: [^<]*", text)[:1])
+            return all(w in text for w in words)
+
+        if not self.page.read(seconds, shown):
+            told = f" (in between it told: {refused[-1]})" if refused else ""
+            raise AssertionError(f"the page never showed {words}{told}; it shows: {self.text()[-3000:]}")
 
     def text(self) -> str:
         contents = (str(p.get("content", "")) for p in self.page.widgets.values())

@@ -140,13 +140,13 @@ class Console:
         telemetry, fresh = self._latest()
         asked = control(intent, telemetry, fresh)
         if by_key and intent is Intent.RESUME and asked.enabled and telemetry and telemetry.state is not State.PAUSED:
-            self._refuse(intent, "after a stop or a fault, click it")
+            self.refuse(intent, "after a stop or a fault, click it")
         elif asked.enabled and intent is Intent.QUIT and time.monotonic() > self._ending_until:
             self._ending_until = time.monotonic() + CONFIRM
         elif asked.enabled:
             self.pressed.put(intent)
         else:
-            self._refuse(intent, asked.reason)
+            self.refuse(intent, asked.reason)
 
     def _hint(self, button: _Button, telemetry: Telemetry | None) -> str:
         if button.intent is Intent.RESUME and telemetry is not None and telemetry.state is not State.PAUSED:
@@ -155,7 +155,8 @@ class Console:
             return "click again to end it"
         return f"key {button.key}" if button.key else ""
 
-    def _refuse(self, intent: Intent, reason: str) -> None:
+    def refuse(self, intent: Intent, reason: str) -> None:
+        """Say on the page that a press had no effect, and why."""
         self.refusal = f"{intent.value.replace('_', ' ')} refused: {reason}"
         self._refused_at = time.monotonic()
 

@@ -18,6 +18,8 @@ log = logging.getLogger(__name__)
 
 GEOMETRY_RETRY = 2.0
 """Seconds after which an unanswered request for the geometry is given up and asked again."""
+TAKE = 300
+"""Milliseconds."""
 
 
 class Latest:
@@ -127,9 +129,11 @@ class Feeds:
         self._intents.connect(endpoints.intents)
 
     def send(self, intent: Intent, operator: str) -> bool:
-        """Hand an intent to the app; False when nobody takes it (then it is dropped, never sent late)."""
+        """Hand an intent to the app; False when nobody takes it (then it is dropped, never sent late). Waits TAKE at
+        most: this socket finds an app that has just begun to listen a moment after the app's own words arrive here."""
         try:
             message = OperatorIntent(intent=intent, operator=operator, stamp=time.monotonic())
+            self._intents.poll(TAKE, zmq.POLLOUT)
             self._intents.send(pack(message), zmq.NOBLOCK)
         except zmq.Again:
             return False

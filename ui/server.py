@@ -145,6 +145,7 @@ class Page:
                 return
             if not self._feeds.send(intent, self._options.operator) and intent is not Intent.STOP:
                 log.warning("nobody takes the intent %s: is the app running?", intent.value)
+                self._console.refuse(intent, "the app did not take it; press again")
 
     def close(self) -> None:
         self._why.close()
