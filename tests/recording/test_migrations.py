@@ -47,8 +47,8 @@ def lowered(folder: Path, lower: Callable[[str, dict[str, Any]], dict[str, Any]]
                     known = writer.register_schema(schema.name, schema.encoding, schema.data) if schema else 0
                     channels[channel.topic] = writer.register_channel(channel.topic, "json", known)
                 data = json.dumps(lower(channel.topic, json.loads(message.data))).encode()
-                known = channels[channel.topic]
-                writer.add_message(known, message.log_time, data, message.publish_time, message.sequence)
+                at = channels[channel.topic]
+                writer.add_message(at, message.log_time, data, message.publish_time, message.sequence)
             writer.finish()
 
 
