@@ -207,6 +207,31 @@ class KeepsWeights(Protocol):
         ...
 
 
+class Person(Protocol):
+    """Somebody who may take the arm from the policy during an attempt."""
+
+    @property
+    def steers(self) -> bool:
+        """The person has the arm."""
+        ...
+
+    def action(self, observation: Observation) -> Float[np.ndarray, "A"] | None:
+        """The coming tick's action, like a policy's; None while the policy acts. Asked once a tick; never waits."""
+        ...
+
+
+class Nobody:
+    """far_app.protocols.Person where none is there."""
+
+    steers = False
+
+    def action(self, observation: Observation) -> None:
+        return None
+
+
+NOBODY = Nobody()
+
+
 @runtime_checkable
 class SuccessDetector(Protocol):
     """Says when an attempt is over."""

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from far_app.session_states import Intent, State
+from far_app.take_over import Steering
 from far_app.types import AdaptationStep, Pose, RobotStatus
 from far_app.wire import register
 
@@ -49,7 +50,7 @@ class TrialRow:
     seconds: float
     note: str = ""
     counted: bool = True
-    """False for a trial that began at reduced speed: not for statistics."""
+    """False for a trial that began at reduced speed, or in which a person helped: not for statistics."""
 
 
 @register
@@ -118,6 +119,8 @@ class Telemetry:
     """Why the last intent was refused."""
     allowed: tuple[Intent, ...] = ()
     """Intents that apply now."""
+    steering: Steering = field(default_factory=Steering)
+    """A person's part in the attempt."""
 
 
 @register

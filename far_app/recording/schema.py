@@ -198,6 +198,8 @@ LINES = {
     "outcome_marked": "someone's word on an attempt: `detail.success`, `detail.judged_by`, `detail.note`",
     "flag_corrected": "the operator's word on a chunk: `detail.trial`, `detail.attempt`, `detail.tick`, "
     "`detail.flagged`, `detail.by`, `detail.used` (it came in time for the adaptation)",
+    "taken_over": "a person has the arm from here on: `detail.source` (page or device)",
+    "handed_back": "the policy has it again; `detail.ticks` of this attempt were a person's",
     "trial_ended": "`detail.success`, `detail.attempts`",
     "recording_failed": "the writer gave up; `text` says why",
     "recorder_late": "the writer was more than 1 s behind the loop; `detail.seconds`",

@@ -9,7 +9,8 @@ import numpy as np
 
 from far_app.config import TaskConfig
 from far_app.motion import ActionScale
-from far_app.session_states import State, allowed
+from far_app.session_states import Intent, State
+from far_app.take_over import Steering
 from far_app.telemetry import LogLine, Telemetry, TrialRow
 from far_app.types import ActionChunk, Adaptation, AdaptationStep, Observation, Step, Trial
 
@@ -37,6 +38,7 @@ class Board:
         self.countdown = 0.0
         """Seconds until an announced attempt begins."""
         self.refusal = ""
+        self.steering = Steering()
         self.adaptation_steps: tuple[AdaptationStep, ...] = ()
         self.adapting = False
         self.trial = self.attempt = self.scene_seed = 0
@@ -86,7 +88,7 @@ class Board:
             )
         )  # fmt: skip
 
-    def telemetry(self, state: State, newest: Observation | None) -> Telemetry:
+    def telemetry(self, state: State, newest: Observation | None, allowed: tuple[Intent, ...] = ()) -> Telemetry:
         """A snapshot; sequence number, stamp and loop health are the publisher's."""
         curve, latest, step = self._curve, self._latest, self._step
         values = curve.values if curve is not None and len(curve.values) else self._values
@@ -107,7 +109,8 @@ class Board:
             robot=newest.status if newest else None, joints=newest.joints if newest else np.zeros(0),
             eef=newest.eef if newest else None, gripper=newest.gripper if newest else 0.0,
             action=step.commanded if step is not None else np.zeros(0), chunk_path=self._path(newest),
-            history=tuple(self._history), log=tuple(self._log), refusal=self.refusal, allowed=allowed(state),
+            history=tuple(self._history), log=tuple(self._log), refusal=self.refusal, allowed=allowed,
+            steering=self.steering,
         )  # fmt: skip
 
     def _path(self, newest: Observation | None) -> np.ndarray:
