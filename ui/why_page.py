@@ -15,7 +15,9 @@ import viser
 from ui import why_html
 from ui.keys import Page, add_hotkey, hint, key_of
 from ui.page_server import Presses
+from ui.presence import Presence
 from ui.scene3d import BRAND
+from ui.viewers import Live, Viewers
 from ui.why_model import Attribution, Case
 from ui.why_scene import WhyScene
 from ui.why_state import Looking, Offer, Press
@@ -65,10 +67,13 @@ class Shown:
 class WhyPage:
     """One page for all clients. `show` from one thread only."""
 
-    def __init__(self, server: viser.ViserServer, *, scene3d: bool = True) -> None:
+    def __init__(self, server: viser.ViserServer, presence: Presence, *, scene3d: bool = True) -> None:
         self.events: queue.SimpleQueue[tuple[Press, float]] = queue.SimpleQueue()
         """What was pressed, oldest first; a slider's with its value."""
-        self._gui, self._presses = server.gui, Presses(server)
+        self._gui, self._presses = server.gui, Presses(server, presence)
+        self.refusals: queue.SimpleQueue[str] = queue.SimpleQueue()
+        """What was refused for want of control, and why."""
+        self._presses.refused = lambda what, why: self.refusals.put(f"{what} is refused: {why}")
         self._buttons: dict[Press, tuple[str, viser.GuiButtonHandle, viser.CommandHandle]] = {}
         self._sliders: dict[Press, viser.GuiSliderHandle[Any]] = {}
         self._touched: dict[Press, float] = {}
@@ -77,6 +82,7 @@ class WhyPage:
         self._scene = WhyScene(server) if scene3d else None
         self._drawn: tuple[object, ...] = ()
         self._build()
+        self._viewers = Viewers(server, self._presses, presence, Page.WHY)
 
     def _build(self) -> None:
         gui = self._gui
@@ -133,11 +139,13 @@ class WhyPage:
             Press.CORRECT: "Unflag" if flagged else "Flag",
             Press.CRITIC: s.looking.choice.critic.rsplit("/", 1)[-1].removesuffix(".safetensors"),
         }
-        for press, (label, handle, command) in self._buttons.items():
+        live: list[Live] = []
+        for press, (label, handle, hotkey) in self._buttons.items():
             offer = s.offers[press]
-            handle.disabled, command.disabled = not offer.enabled, not offer.enabled
             line = f"{offer.line} · {hint(Page.WHY, press)}".removeprefix(" · ") if offer.enabled else offer.line
-            handle.label = f"{names.get(press, label)}\n{line}"
+            name = names.get(press, label)
+            live.append(Live(button=handle, hotkey=hotkey, enabled=offer.enabled, label=name, line=line))
+        self._viewers.show(live)
         self._set_sliders(s)
         if self._scene is not None:
             key = (id(case), id(found), tick, id(s.moved))
