@@ -207,6 +207,19 @@ class KeepsWeights(Protocol):
         ...
 
 
+@runtime_checkable
+class ChangesWeights(Protocol):
+    """A method that can be told which version to act with."""
+
+    @property
+    def policy(self) -> Policy: ...
+
+    def use(self, weights: AdaptedWeights | None, version: str, *, base: bool) -> None:
+        """From now on act with these weights, None for the policy it was made with; `base`: trials begin with them.
+        Between attempts only; may take as long as making a policy does. Raises FarError where they do not fit."""
+        ...
+
+
 class Person(Protocol):
     """Somebody who may take the arm from the policy during an attempt."""
 

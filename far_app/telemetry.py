@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from far_app.lineage import Versions
+from far_app.marks import Judged
 from far_app.session_states import Intent, State
 from far_app.take_over import Steering
 from far_app.types import AdaptationStep, Pose, RobotStatus
@@ -113,6 +115,9 @@ class Telemetry:
     loop: LoopHealth = field(default_factory=LoopHealth)
     history: tuple[TrialRow, ...] = ()
     """Newest last, at most 200."""
+    attempts: tuple[Judged, ...] = ()
+    """Those that ended, newest last, at most 300."""
+    versions: Versions = field(default_factory=Versions)
     log: tuple[LogLine, ...] = ()
     """Newest last, at most 50."""
     refusal: str = ""

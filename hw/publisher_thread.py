@@ -80,7 +80,9 @@ class PublisherThread:
                 self.seq += 1
                 status, acks = controller.status(), controller.take_acks()
             newest, pictures = self._servo.newest, self._pictures
-            message = observation(self.seq, pictures.stamp, newest.measured, status, acks, pictures.images, self._device())
+            message = observation(
+                self.seq, pictures.stamp, newest.measured, status, acks, pictures.images, self._device()
+            )
             socket.send(pack(message), zmq.NOBLOCK)
             if pictures.seq != shown:
                 shown = pictures.seq

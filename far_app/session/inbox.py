@@ -6,11 +6,12 @@ import logging
 import queue
 import threading
 import time
-
 from typing import Any, TypeVar
 
 import zmq
 
+from far_app.lineage import VersionWish
+from far_app.marks import MarkAttempt
 from far_app.session_states import Intent
 from far_app.take_over import Nudge
 from far_app.telemetry import OperatorIntent, PagePresence
@@ -19,7 +20,7 @@ from far_app.wire import WireError, unpack
 
 log = logging.getLogger(__name__)
 
-WORDS = (CorrectFlag, Nudge)
+WORDS = (CorrectFlag, Nudge, MarkAttempt, VersionWish)
 """What the page may say besides an intent."""
 _W = TypeVar("_W")
 
@@ -51,7 +52,7 @@ class IntentInbox:
             intents.append(self._queue.get_nowait())
         return intents
 
-    def say(self, word: CorrectFlag | Nudge) -> None:
+    def say(self, word: CorrectFlag | Nudge | MarkAttempt | VersionWish) -> None:
         """One of WORDS, from any thread."""
         self._words[type(word)].put(word)
 

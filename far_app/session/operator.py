@@ -5,10 +5,14 @@ from __future__ import annotations
 import time
 
 from far_app.errors import RobotError
+from far_app.lineage import VersionWish
+from far_app.marks import MarkAttempt
 from far_app.protocols import Resume
 from far_app.session.inbox import IntentInbox
+from far_app.session.marking import Marking
 from far_app.session.standing import Standing
 from far_app.session.steering import Helper
+from far_app.session.versions import VersionKeeper
 from far_app.session_states import Intent, State
 from far_app.take_over import Source
 from far_app.types import Judge, Outcome, RobotMode
@@ -17,8 +21,17 @@ from far_app.types import Judge, Outcome, RobotMode
 class Operator:
     """The intents of an inbox, acted on."""
 
-    def __init__(self, inbox: IntentInbox, standing: Standing, helper: Helper, period: float) -> None:
-        self.inbox, self.standing, self.helper = inbox, standing, helper
+    def __init__(
+        self,
+        inbox: IntentInbox,
+        standing: Standing,
+        helper: Helper,
+        marking: Marking,
+        versions: VersionKeeper,
+        period: float,
+    ) -> None:
+        self.inbox, self.standing, self.helper, self.marking = inbox, standing, helper, marking
+        self.versions = versions
         self.board, self.robot, self.recorder = standing.board, standing.robot, standing.recorder
         self._period = period
         """Of the loop, seconds."""
@@ -31,8 +44,16 @@ class Operator:
         pressed = self.helper.pressed()
         if pressed is not None:
             self.ask(pressed, phase, Source.DEVICE)
+        self.listen()
+
+    def listen(self) -> None:
+        """What is no intent: presses that move the arm, words on attempts and policy versions."""
         self.helper.nudge()
-        self.board.steering = self.helper.told()
+        for mark in self.inbox.take(MarkAttempt):
+            self.marking.hear(mark)
+        for wish in self.inbox.take(VersionWish):
+            self.versions.hear(wish)
+        self.board.steering, self.board.versions = self.helper.told(), self.versions.told()
 
     def ask(self, intent: Intent, phase: str, source: Source = Source.PAGE) -> None:
         """Refuse an intent with a reason, or obey it."""

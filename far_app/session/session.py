@@ -23,6 +23,7 @@ from far_app.session.board import Board
 from far_app.session.clock import TickClock
 from far_app.session.inbox import IntentInbox
 from far_app.session.lessons import Lessons
+from far_app.session.marking import Marking
 from far_app.session.operator import Operator
 from far_app.session.planners import ThreadedPlanner
 from far_app.session.publisher import TelemetryPublisher
@@ -33,6 +34,7 @@ from far_app.session.standing import IN_ATTEMPT, Standing
 from far_app.session.statistics import LoopStatistics
 from far_app.session.steering import Helper
 from far_app.session.supervision import Supervision, TrialAbandoned
+from far_app.session.versions import VersionKeeper
 from far_app.session.watched import WatchedRobot
 from far_app.session_states import Happening, State
 from far_app.trial import (
@@ -82,12 +84,17 @@ class Session:
             no_take_over=settings.no_take_over,
         )  # fmt: skip
         self.helper = Helper(self.standing, inbox, scale)
-        self.inbox, self.operator = inbox, Operator(inbox, self.standing, self.helper, self.clock.period)
+        marking = Marking(self.standing, settings.name)
+        self.versions = VersionKeeper(self.standing, method, recorder.folder)
+        self.inbox, self.operator = (
+            inbox,
+            Operator(inbox, self.standing, self.helper, marking, self.versions, self.clock.period),
+        )
         self.supervision = Supervision(
             standing=self.standing, operator=self.operator, helper=self.helper, planner=planner, clock=self.clock,
             freshness=settings.freshness, headless=settings.headless, page_silence=settings.page_silence,
         )  # fmt: skip
-        self.lessons = Lessons(self.standing, session=settings.name, limit=settings.adaptation_limit)
+        self.lessons = Lessons(self.standing, self.versions, session=settings.name, limit=settings.adaptation_limit)
         self.results: list[TrialResult] = []
         self.last_failure: Attempt | None = None
         """The newest failed attempt."""
@@ -132,6 +139,7 @@ class Session:
         self.standing.trial_begins()
         self._seed, self._attempts = seed, []
         self.lessons.trial_begins()
+        self.versions.trial_begins()
         self.board.trial_started(number, seed)
         self.recorder.begin_trial(number, seed)
         self.standing.say(f"trial {number}: scene {seed}")
@@ -195,8 +203,9 @@ class Session:
         self.standing.happen(Happening.AT_HOME)
         self.standing.no_lesson = False
         self.helper.attempt_begins()
-        self.board.attempt_started(event.attempt_index, event.policy_version)
-        self.recorder.begin_attempt(event.attempt_index, event.policy_version)
+        version = self.versions.attempt_begins(event.policy_version)
+        self.board.attempt_started(event.attempt_index, version)
+        self.recorder.begin_attempt(event.attempt_index, version)
         if slowly:
             self.standing.say(f"attempt {event.attempt_index} runs at 1/{self._stretch} of the policy's speed")
             self.recorder.event("reduced_speed", pace.strip(), {"stretch": self._stretch})
@@ -213,6 +222,8 @@ class Session:
             self._record(step)
         self._report()
         self.recorder.end_attempt(attempt)
+        self.board.history.attempt_ended(self.board.trial, attempt)
+        self.versions.attempt_ended(attempt.outcome.success)
         self._in_attempt = False
         self._attempts.append(attempt)
         self.last_failure = self.last_failure if attempt.outcome.success else attempt

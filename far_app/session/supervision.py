@@ -103,6 +103,7 @@ class Supervision:
                 self.operator.ask(intent, "between")
                 if asked is State.AWAITING_SCENE and self.standing.state is State.READY:
                     return True
+            self.operator.listen()
             self._notice("between")
             self.rest("between")
         return False

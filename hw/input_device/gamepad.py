@@ -1,9 +1,9 @@
 """A gamepad's input events (evdev): two sticks, a cross, buttons; Linux's own codes, so any pad its drivers know.
 
-    struct input_event { long sec; long usec; u16 type; u16 code; s32 value; }      24 bytes on a 64-bit machine
+    struct input_event { long sec; long usec; u16 type; u16 code; s32 value; }      24 bytes, 64-bit
 
-Left stick: forward and left; right stick: up, and turn about the vertical; cross: tilt. The left shoulder button must be
-held for anything to move: a pad that lies on its stick moves nothing. A closes, B opens, Start takes over and hands back.
+Left stick: forward and left; right stick: up, and turn about the vertical; cross: tilt. Nothing moves unless the left
+shoulder button is held: a pad may lie on its stick. A closes, B opens, Start takes over and hands back.
 """
 
 from __future__ import annotations

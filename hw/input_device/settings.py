@@ -28,7 +28,9 @@ class InputDeviceSettings:
 
     def __post_init__(self) -> None:
         if self.kind not in ("", "spacemouse", "gamepad"):
-            raise ConfigError(f"input_device.kind is '{self.kind}'; choose one of: spacemouse, gamepad, or leave it out")
+            raise ConfigError(
+                f"input_device.kind is '{self.kind}'; choose one of: spacemouse, gamepad, or leave it out"
+            )
         for name in ("speed", "turn_speed"):
             if not 0 < getattr(self, name) <= 1:
                 raise ConfigError(f"input_device.{name} is {getattr(self, name)}, must be above 0 and at most 1")

@@ -212,7 +212,7 @@ def test_a_named_path_is_opened_and_read(tmp_path):
     reader = InputReader(InputDeviceSettings(kind="gamepad", path=str(path), facing=True, deadzone=0.0))
     reader.start()
     os.write(writer, event(EV_KEY, SHOULDER, 1) + event(EV_ABS, ABS_Y, -32768))
-    wait(lambda: reader.newest().motion.any())
+    wait(lambda: bool(reader.newest().motion.any()))
     assert reader.newest().motion[0] == pytest.approx(-0.4), "from the front, forward is toward the person"
     reader.close()
     os.close(writer)
