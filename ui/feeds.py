@@ -129,8 +129,9 @@ class Feeds:
         self._intents.connect(endpoints.intents)
 
     def send(self, said: Any, operator: str) -> bool:
-        """Hand an intent, or another registered word, to the app; False when nobody takes it (then it is dropped, never sent late). Waits TAKE at
-        most: this socket finds an app that has just begun to listen a moment after the app's own words arrive here."""
+        """Hand an intent, or another registered word, to the app; False when nobody takes it (then it is dropped, never
+        sent late). Waits TAKE at most: this socket finds an app that has just begun to listen a moment after the app's
+        own words arrive here."""
         try:
             is_intent = isinstance(said, Intent)
             message = OperatorIntent(intent=said, operator=operator, stamp=time.monotonic()) if is_intent else said

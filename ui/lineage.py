@@ -85,8 +85,6 @@ def no_undo(telemetry: Telemetry) -> str:
 
 def _row(row: PolicyRow, telemetry: Telemetry, chosen: bool) -> str:
     versions = telemetry.versions
-    words = [
-        word for word, is_it in (("acts", row.name == versions.acting), ("base", row.name == versions.base)) if is_it
-    ]
+    words = ["acts"] * (row.name == versions.acting) + ["base"] * (row.name == versions.base)
     cells = (row.name, row.parent or "–", str(row.pairs or "–"), str(row.acted), str(row.solved), ", ".join(words))
     return f'<tr class="{"on" if chosen else ""}">{"".join(f"<td>{escape(cell)}</td>" for cell in cells)}</tr>'

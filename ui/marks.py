@@ -1,4 +1,4 @@
-"""The panel for a person's word on attempts: the program's judgment, the last word beside it, a note; any earlier one."""
+"""The panel for a person's word on attempts: the program's judgment, the last word beside it, a note."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ class Marks:
         self._draft = ""
         self._field: viser.GuiTextHandle | None = None
         self.items = [
-            Item(label="Earlier", box=(0.8, 9.4, 7.4, 4.1), reason=self._no_earlier, asks=self._earlier, action=EARLIER),
+            Item(label="Earlier", box=(0.8, 9.4, 7.4, 4.1), reason=self._no_earlier, asks=self._earlier,
+                 action=EARLIER),
             Item(label="Later", box=(8.7, 9.4, 7.4, 4.1), reason=self._no_later, asks=self._later, action=LATER),
             Item(label="Was a success", box=(16.6, 9.4, 7.4, 4.1), color=GREEN,
                  reason=lambda t: self._cannot(t, Verdict.SUCCESS), asks=lambda t: self._word(t, Verdict.SUCCESS)),
@@ -84,10 +85,7 @@ class Marks:
     def _cannot(self, telemetry: Telemetry, verdict: Verdict) -> str:
         judged = self.chosen(telemetry)
         if judged is not None:
-            last = judged.verdict or (Verdict.SUCCESS if judged.success else Verdict.FAILURE)
-            return (
-                "it counts as that" if judged.verdict is verdict or (judged.verdict is None and last is verdict) else ""
-            )
+            return "you said so" if judged.verdict is verdict else ""
         if self._place(telemetry) is None:
             return "no attempt yet"
         return "" if verdict is Verdict.UNSURE else "it is under way"
