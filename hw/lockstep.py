@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from far_app.config import TaskConfig
 from far_app.errors import RobotError
-from far_app.protocols import Request, Reset
+from far_app.protocols import Guide, Request, Reset
 from far_app.types import Observation, RobotMode, Target
 from hw.controller import ArmController
 from hw.observing import observation
@@ -75,6 +75,8 @@ class LockstepRobot:
             self.controller.refuse_latched("Reset")
             self.plant.reset(request.seed)
             self.controller.reset(self.plant.measure(), request.seed)
+        elif isinstance(request, Guide) and request.on:
+            self.plant.guide(True)
         else:
             self.controller.request(request, self.now)
         self._observation = None
