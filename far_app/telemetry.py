@@ -9,8 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 from far_app.session_states import Intent, State
+from far_app.trial_plan.shown import PlanShown, SceneShown
 from far_app.types import AdaptationStep, Pose, RobotStatus
 from far_app.wire import register
+
+HIDDEN = "hidden"
+"""Telemetry.adaptation_status where a blinded plan must not tell whether the method learns."""
 
 
 @register
@@ -118,6 +122,10 @@ class Telemetry:
     """Why the last intent was refused."""
     allowed: tuple[Intent, ...] = ()
     """Intents that apply now."""
+    plan: PlanShown | None = None
+    """The plan of trials that is run, if one is."""
+    scene: SceneShown | None = None
+    """A plan's real scene that is being rebuilt."""
 
 
 @register

@@ -13,7 +13,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from far_app.protocols import Method, PlanRequest, Policy, SuccessDetector
 from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
 from far_app.scheduling import PROMPT_NICENESS, nice
+from far_app.session.course import Course
 from far_app.session.inbox import IntentInbox
 from far_app.session.planners import ThreadedPlanner, plan_one
 from far_app.session.publisher import TelemetryPublisher
@@ -46,6 +47,7 @@ from far_app.session.statistics import LoopStatistics
 from far_app.station import station_at
 from far_app.tasks import supervised
 from far_app.tasks import task as find_task
+from far_app.trial_plan.plan import TrialPlan
 from hw.camera_config import with_views
 from hw.rig import RigConfig
 from hw.setup import setup_of
@@ -66,7 +68,8 @@ class Stage:
     options: RunOptions
     task: TaskConfig
     rig: RigConfig
-    parts: Parts
+    methods: Mapping[str, Parts]
+    """What may act, by the name it has here; one but for a plan."""
     robot: RemoteRobot
     folder: Path
     family: Family
@@ -75,16 +78,22 @@ class Stage:
     page: Child | None
     page_url: str
 
-    def writer(self) -> SessionWriter:
+    @property
+    def parts(self) -> Parts:
+        """What acts, or the first of a plan."""
+        return next(iter(self.methods.values()))
+
+    def writer(self, plan: TrialPlan | None = None) -> SessionWriter:
         """A new recording of what this stage is made of. Raises RecordingError."""
         options = self.options
+        planned = {"plan": plan.record()} if plan is not None else {}
         return SessionWriter(
             options.recordings,
             SessionInfo(
-                task=self.task.name, method=options.method, rig=dataclasses.asdict(self.rig),
+                task=self.task.name, method=plan.name if plan else options.method, rig=dataclasses.asdict(self.rig),
                 policy=self.parts.policy_name, seed=options.seed, cameras=self.parts.method.policy.spec.cameras,
                 rate=self.task.rate,
-                config={"run": dataclasses.asdict(options), "task": dataclasses.asdict(self.task)},
+                config={"run": dataclasses.asdict(options), "task": dataclasses.asdict(self.task), **planned},
             ),
         )  # fmt: skip
 
@@ -114,9 +123,14 @@ class Stage:
 
     @contextlib.contextmanager
     def session(
-        self, writer: SessionWriter, inbox: IntentInbox, statistics: LoopStatistics, method: Method | None = None
+        self,
+        writer: SessionWriter,
+        inbox: IntentInbox,
+        statistics: LoopStatistics,
+        method: Method | None = None,
+        course: Course | None = None,
     ) -> Iterator[Session]:
-        """A session on this stage, with the page told about it and revived when it dies."""
+        """A session on this stage, with the page told about it and revived when it dies. `course`: a plan's."""
         options = self.options
         publisher = None
         if options.rerun:
@@ -134,7 +148,7 @@ class Stage:
                     robot=robot, planner=ThreadedPlanner(), method=method or self.parts.method,
                     detector=detector, task=self.task, scale=self.rig.scale_for(self.task),
                     recorder=Recorder(writer), inbox=inbox, statistics=statistics, publisher=publisher,
-                    alarm=failure_alarm(options),
+                    alarm=failure_alarm(options), course=course,
                 )  # fmt: skip
                 if options.shadow:
                     session.standing.say("shadow run: plans are shown, the arm is held", "warning")
@@ -144,8 +158,19 @@ class Stage:
                 publisher.close()
 
 
+Assembling = Callable[[RunOptions, TaskConfig], Mapping[str, Parts]]
+
+
+def one_method(options: RunOptions, task: TaskConfig) -> Mapping[str, Parts]:
+    """What the options themselves ask for."""
+    parts = assemble(
+        options.method, task, options.policy, options.critic, options.device, options.retry, options.engine
+    )
+    return {options.method: parts}
+
+
 @contextlib.contextmanager
-def stage(options: RunOptions) -> Iterator[Stage]:
+def stage(options: RunOptions, assembling: Assembling = one_method) -> Iterator[Stage]:
     """Start everything, wait until it is ready, end everything. Raises the FarError of whatever cannot start."""
     rig = options.load_rig()
     task = with_views(find_task(options.task, rig.arm), rig.cameras)
@@ -156,9 +181,8 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         stack.callback(family.end)
         hardware, rig = find_hardware(folder, family, options, rig)
         page = None if options.headless else family.add(start_page(folder, options, port, task.cameras))
-        parts = assemble(
-            options.method, task, options.policy, options.critic, options.device, options.retry, options.engine
-        )
+        methods = assembling(options, task)
+        parts = next(iter(methods.values()))
         attempts = options.max_attempts or parts.max_attempts or task.max_attempts
         task = dataclasses.replace(task, max_attempts=1 if options.shadow else attempts)
         # From here on this process's threads come before the machine's others: one that is not scheduled while it holds
@@ -168,15 +192,17 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         robot = stack.enter_context(connected(folder, hardware))
         if page is not None:
             wait_for_page(page, options.page_host, port)
-        check_observation(parts.method.policy.spec, robot.observe())
-        preflight(
-            parts.method.policy.spec, policy_card(task.name, options.policy), setup_of(rig, task), robot.observe(),
-            options.accept_differences or options.shadow,
-        )  # fmt: skip
+        for parts in methods.values():
+            check_observation(parts.method.policy.spec, robot.observe())
+            preflight(
+                parts.method.policy.spec, policy_card(task.name, parts.checkpoint), setup_of(rig, task),
+                robot.observe(), options.accept_differences or options.shadow,
+            )  # fmt: skip
         prepare_process(options.torch_threads)
-        warm_up(parts.method.policy, robot)
+        for parts in methods.values():
+            warm_up(parts.method.policy, robot)
         yield Stage(
-            options=options, task=task, rig=rig, parts=parts, robot=robot, folder=folder, family=family,
+            options=options, task=task, rig=rig, methods=methods, robot=robot, folder=folder, family=family,
             hardware=hardware, page=page,
             page_url=f"http://{options.page_host}:{port}" if page is not None else "",
         )  # fmt: skip

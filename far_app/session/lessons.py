@@ -78,8 +78,12 @@ class Lessons:
         weights = method.adapted if isinstance(method, KeepsWeights) else None
         if weights is not None and weights.version == adaptation.version != adaptation.base_version:
             self.standing.recorder.add_weights(weights, adaptation)
+        if self.standing.board.blind:
+            return self.standing.say("the arm is home and what follows the failure is done")
         note = f" ({adaptation.note})" if adaptation.note else ""
-        self.standing.say(f"adaptation: {adaptation.status}, {adaptation.pairs} pairs → {adaptation.version}{note}")
+        return self.standing.say(
+            f"adaptation: {adaptation.status}, {adaptation.pairs} pairs → {adaptation.version}{note}"
+        )
 
     def end(self) -> None:
         """Cancel what still runs; returns once it has ended."""

@@ -48,3 +48,5 @@ class TrialResult:
     judged_by: str
     counted: bool = True
     """False for a trial that began at reduced speed."""
+    finished: bool = True
+    """It ended by itself: solved, or out of attempts; not skipped and not cut off."""
