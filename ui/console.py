@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import viser
@@ -19,11 +18,14 @@ from far_app.session_states import Intent, State
 from far_app.telemetry import Telemetry, View
 from far_app.types import RobotMode
 from ui import html
+from ui.keys import Page, add_hotkey, hint, key_of
 from ui.page_server import Presses
 from ui.plots import Plots
+from ui.presence import Presence
 from ui.scene3d import BRAND, FLAGGED, Scene3D
 from ui.stop import StopLine
 from ui.view_model import Freshness, adaptation, arm_word, banner, control, loop_gauges, summary
+from ui.viewers import Live, Viewers
 
 PLACES = ("front", "wrist")
 """On the page, left to right, as style.css names them, whatever the views are called; more of them: the rerun page."""
@@ -37,8 +39,6 @@ _BLANK = np.full((8, 8, 3), 8, np.uint8)
 class _Button:
     intent: Intent
     label: str
-    key: Any
-    """Hotkey; None for what must be clicked."""
     color: tuple[int, int, int]
     box: tuple[float, float, float, float]
     """Left, top, width, height in page units, below the head."""
@@ -48,19 +48,19 @@ _QUIET, _GREEN, _AMBER = (36, 50, 65), (31, 122, 77), (140, 92, 16)
 _COLUMNS, _WIDTH, _HEIGHT = (0.7, 12.15), 10.85, 4.3
 
 
-def _control(intent: Intent, label: str, key: Any, color: tuple[int, int, int], column: int, row: int) -> _Button:
+def _control(intent: Intent, label: str, color: tuple[int, int, int], column: int, row: int) -> _Button:
     box = (_COLUMNS[column], 11.7 + 4.9 * row, _WIDTH, _HEIGHT)
-    return _Button(intent=intent, label=label, key=key, color=color, box=box)
+    return _Button(intent=intent, label=label, color=color, box=box)
 
 
 _BUTTONS = (
-    _control(Intent.PAUSE, "Pause", "P", _QUIET, 0, 0),
-    _control(Intent.RESUME, "Resume", "R", BRAND, 1, 0),
-    _control(Intent.MARK_SUCCESS, "Mark success", "S", _GREEN, 0, 1),
-    _control(Intent.MARK_FAILURE, "Mark failure", "F", _AMBER, 1, 1),
-    _control(Intent.SKIP_TRIAL, "Skip trial", "K", _QUIET, 0, 2),
-    _control(Intent.SCENE_READY, "Scene ready", "N", BRAND, 1, 2),
-    _Button(intent=Intent.QUIT, label="End session", key=None, color=_QUIET, box=(0.7, 26.4, 22.3, 3.3)),
+    _control(Intent.PAUSE, "Pause", _QUIET, 0, 0),
+    _control(Intent.RESUME, "Resume", BRAND, 1, 0),
+    _control(Intent.MARK_SUCCESS, "Mark success", _GREEN, 0, 1),
+    _control(Intent.MARK_FAILURE, "Mark failure", _AMBER, 1, 1),
+    _control(Intent.SKIP_TRIAL, "Skip trial", _QUIET, 0, 2),
+    _control(Intent.SCENE_READY, "Scene ready", BRAND, 1, 2),
+    _Button(intent=Intent.QUIT, label="End session", color=_QUIET, box=(0.7, 26.4, 22.3, 3.3)),
 )
 
 
@@ -71,6 +71,7 @@ class Console:
         self,
         server: viser.ViserServer,
         stop_line: StopLine,
+        presence: Presence,
         latest: Callable[[], tuple[Telemetry | None, Freshness]],
         *,
         scene3d: bool,
@@ -82,12 +83,14 @@ class Console:
         self.refusal = ""
         """Why the page itself refused the last press."""
         self._gui, self._stop, self._latest = server.gui, stop_line, latest
-        self._presses = Presses(server)
+        self._server, self._presence = server, presence
+        self._presses = Presses(server, presence)
+        self._presses.refused = self.refuse
         self._refused_at = self._ending_until = 0.0
         self._beats = 0
         self._images: dict[str, viser.GuiImageHandle] = {}
         self._pictures: dict[str, bytes] = {}
-        self._controls: dict[Intent, tuple[_Button, viser.GuiButtonHandle, Any]] = {}
+        self._controls: dict[Intent, tuple[_Button, viser.GuiButtonHandle, viser.CommandHandle | None]] = {}
         server.gui.configure_theme(dark_mode=True, brand_color=BRAND, show_logo=False, show_share_button=False)
         server.gui.set_panel_label("FAR")
         self.scene = Scene3D(server) if scene3d else None
@@ -101,10 +104,11 @@ class Console:
         self._head = gui.add_html(html.head(banner(None, fresh), arm_word(None)))
         stop = gui.add_button("STOP", color=FLAGGED)
         self._stop_note = gui.add_html(html.stop_note(None, False, ""))
-        hotkey = gui.add_command("STOP the arm", description="Latches the arm at once", hotkey="space")
+        hotkey = self._hotkey(Intent.STOP, "STOP the arm")
+        assert hotkey is not None
 
-        self._presses.on(stop, lambda: self._press_stop("page: button"))
-        self._presses.on(hotkey, lambda: self._press_stop("page: space key"))
+        self._presses.on(stop, lambda: self._press_stop("page: button"), everyone=True)
+        self._presses.on(hotkey, lambda: self._press_stop("page: space key"), everyone=True)
         places = [_place(stop, (0.7, 0.7, 22.3, 8.6)), _big(stop)]
         places += [self._add_control(button) for button in _BUTTONS]
         self._adapt = gui.add_html(html.adaptation(adaptation(None)))
@@ -113,18 +117,22 @@ class Console:
         self._add_cameras()
         self.plots = Plots(gui)
         self._foot = gui.add_html(html.foot((), "", None, ""))
+        self._viewers = Viewers(self._server, self._presses, self._presence, Page.CONSOLE)
         gui.add_html(f"<style>{_STYLE}\n@media (min-width: 768px) {{ {' '.join(places)} }}</style>")
 
     def _add_control(self, button: _Button) -> str:
         handle = self._gui.add_button(button.label, disabled=True, color=button.color)
 
         self._presses.on(handle, lambda: self._press(button.intent))
-        command = None
-        if button.key is not None:
-            command = self._gui.add_command(button.label, hotkey=button.key, disabled=True)
+        command = self._hotkey(button.intent, button.label, disabled=True)
+        if command is not None:
             self._presses.on(command, lambda: self._press(button.intent, by_key=True))
         self._controls[button.intent] = (button, handle, command)
         return _place(handle, button.box)
+
+    def _hotkey(self, action: str, label: str, *, disabled: bool = False) -> viser.CommandHandle | None:
+        key = key_of(Page.CONSOLE, action)
+        return add_hotkey(self._gui, key, label, disabled=disabled) if key is not None else None
 
     def _add_cameras(self) -> None:
         for camera, place in zip(self._cameras, PLACES, strict=False):
@@ -140,24 +148,24 @@ class Console:
         telemetry, fresh = self._latest()
         asked = control(intent, telemetry, fresh)
         if by_key and intent is Intent.RESUME and asked.enabled and telemetry and telemetry.state is not State.PAUSED:
-            self.refuse(intent, "after a stop or a fault, click it")
+            self.refuse(intent.value, "after a stop or a fault, click it")
         elif asked.enabled and intent is Intent.QUIT and time.monotonic() > self._ending_until:
             self._ending_until = time.monotonic() + CONFIRM
         elif asked.enabled:
             self.pressed.put(intent)
         else:
-            self.refuse(intent, asked.reason)
+            self.refuse(intent.value, asked.reason)
 
     def _hint(self, button: _Button, telemetry: Telemetry | None) -> str:
         if button.intent is Intent.RESUME and telemetry is not None and telemetry.state is not State.PAUSED:
             return "the arm may move"
         if button.intent is Intent.QUIT and time.monotonic() < self._ending_until:
             return "click again to end it"
-        return f"key {button.key}" if button.key else ""
+        return hint(Page.CONSOLE, button.intent)
 
-    def refuse(self, intent: Intent, reason: str) -> None:
+    def refuse(self, what: str, reason: str) -> None:
         """Say on the page that a press had no effect, and why."""
-        self.refusal = f"{intent.value.replace('_', ' ')} refused: {reason}"
+        self.refusal = f"{what.replace('_', ' ').lower()} refused: {reason}"
         self._refused_at = time.monotonic()
 
     def beat(self, fresh: Freshness) -> None:
@@ -179,12 +187,7 @@ class Console:
         self._head.content = html.head(banner(telemetry, fresh), arm_word(status))
         latched = status is not None and status.mode is RobotMode.LATCHED
         self._stop_note.content = html.stop_note(self._stop.result, latched, status.reason if status else "")
-        for intent, (button, handle, command) in self._controls.items():
-            now = control(intent, telemetry, fresh)
-            line = self._hint(button, telemetry) if now.enabled else now.reason
-            handle.disabled, handle.label = not now.enabled, f"{button.label}\n{line}"
-            if command is not None:
-                command.disabled = not now.enabled
+        self._show_controls(telemetry, fresh)
         self._adapt.content = html.adaptation(adaptation(telemetry))
         refusal = self.refusal if time.monotonic() - self._refused_at < 6 else ""
         gauges, session = loop_gauges(telemetry), telemetry.session if telemetry else ""
@@ -193,6 +196,14 @@ class Console:
             self._events.content = html.events(telemetry.log, telemetry.stamp)
             refusal = refusal or telemetry.refusal
         self._foot.content = html.foot(gauges, refusal, viewer, session, why)
+
+    def _show_controls(self, telemetry: Telemetry | None, fresh: Freshness) -> None:
+        live: list[Live] = []
+        for intent, (button, handle, hotkey) in self._controls.items():
+            now = control(intent, telemetry, fresh)
+            line = self._hint(button, telemetry) if now.enabled else now.reason
+            live.append(Live(button=handle, hotkey=hotkey, enabled=now.enabled, label=button.label, line=line))
+        self._viewers.show(live)
 
     def pictures(self, view: View) -> None:
         """The cameras' JPEGs as they came: no decoding and no encoding on the way to the browser."""

@@ -8,6 +8,7 @@ from html import escape
 import numpy as np
 
 from far_app.telemetry import LogLine, Telemetry, TrialRow
+from ui.keys import Page, keys_of
 from ui.stop import StopResult
 from ui.view_model import AdaptationCard, Banner, Freshness, Gauge, Tone
 
@@ -112,8 +113,18 @@ def foot(gauges: tuple[Gauge, ...], refusal: str, viewer: str | None, session: s
     if why:
         link = f'<a href="{escape(why)}" target="_blank" rel="noreferrer">why did it fail ↗</a>' + link
     said = f'<span class="far-refusal">{escape(refusal)}</span>' if refusal else ""
-    items += said + f'<span class="far-session">{escape(session)}</span>' + link
+    items = f'{said}<div class="far-gauges">{items}</div><span class="far-session">{escape(session)}</span>{link}'
     return f'<div class="far-foot" id="op-loop">{items}</div>'
+
+
+def keys(page: Page, shown: bool) -> str:
+    """The list on `?`, from the keys table; "" hides it."""
+    rows = "".join(
+        f"<tr><td><kbd>{escape(key.cap)}</kbd></td><td>{escape(key.does)}</td></tr>" for key in keys_of(page)
+    )
+    note = "Keys do nothing while a text field has the focus. ? closes this list."
+    body = f"<div><h2>Keys</h2><table>{rows}</table><p>{note}</p></div>" if shown else ""
+    return f'<div class="far-keys{" on" if shown else ""}" id="op-keys">{body}</div>'
 
 
 def caption(title: str, note: str = "", mark: str = "") -> str:

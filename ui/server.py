@@ -20,11 +20,12 @@ from pathlib import Path
 from far_app.endpoints import Endpoints
 from far_app.session_states import Intent
 from far_app.telemetry import Telemetry
+from ui.access import Access
 from ui.console import Console
 from ui.feeds import Feeds
 from ui.live_viewer import LiveViewer
 from ui.live_why import LiveWhy
-from ui.page_server import open_page, page_url
+from ui.page_server import open_page
 from ui.parent import die_with_parent, run_until_told
 from ui.presence import Presence
 from ui.stop import StopLine, hasten
@@ -56,6 +57,8 @@ class Every:
 class PageOptions:
     run_folder: Path
     host: str = "127.0.0.1"
+    token: Path | None = None
+    """File of what a browser must show to open the page; needed on any address but loopback."""
     port: int = 8080
     scene3d: bool = True
     operator: str = "operator"
@@ -73,17 +76,19 @@ class Page:
     def __init__(self, options: PageOptions) -> None:
         self._options = options
         endpoints = Endpoints.in_folder(options.run_folder)
+        access = Access.at(options.host, options.token)
         self._presence = Presence()
-        self._server = open_page(options.host, options.port, self._presence)
-        self.port = self._server.get_port()
+        self._server = open_page(access, options.port, self._presence)
+        self.url = access.url(self._server.get_port())
         listener = self._server._websock_server._server_thread
         if listener is not None and listener.native_id is not None:
             hasten(listener.native_id)  # the thread that hears STOP
         self._feeds = Feeds(endpoints)
         self._stop_line = StopLine(endpoints)
         self._console = Console(
-            self._server, self._stop_line, self._latest, scene3d=options.scene3d, cameras=options.cameras
-        )
+            self._server, self._stop_line, self._presence, self._latest, scene3d=options.scene3d,
+            cameras=options.cameras,
+        )  # fmt: skip
         self._viewer = LiveViewer(options.run_folder, options.recordings) if options.rerun else None
         self._why = LiveWhy(options.run_folder, options.recordings, options.operator)
         self._plots, self._texts, self._trails, self._beats = Every(1 / 5), Every(1 / 5), Every(1 / 5), Every(1 / 2)
@@ -145,7 +150,7 @@ class Page:
                 return
             if not self._feeds.send(intent, self._options.operator) and intent is not Intent.STOP:
                 log.warning("nobody takes the intent %s: is the app running?", intent.value)
-                self._console.refuse(intent, "the app did not take it; press again")
+                self._console.refuse(intent.value, "the app did not take it; press again")
 
     def close(self) -> None:
         self._why.close()
@@ -160,7 +165,7 @@ def serve(options: PageOptions, ended: threading.Event) -> None:
     """Run the page until `ended` is set or our parent is gone."""
     orphaned = die_with_parent()
     page = Page(options)
-    log.info("the operator page is at %s", page_url(options.host, page.port))
+    log.info("the operator page is at %s", page.url)
     gc.freeze()
     try:
         due = time.monotonic()
@@ -175,7 +180,8 @@ def serve(options: PageOptions, ended: threading.Event) -> None:
 def parse(arguments: Sequence[str] | None) -> PageOptions:
     parser = argparse.ArgumentParser(prog="python -m ui.server", description="The operator page of one run.")
     parser.add_argument("--run-folder", type=Path, required=True, help="folder with the run's sockets")
-    parser.add_argument("--host", default="127.0.0.1", help="loopback address to bind")
+    parser.add_argument("--host", default="127.0.0.1", help="address to bind; any but loopback needs --token")
+    parser.add_argument("--token", type=Path, default=None, help="file of the token, made where it is missing")
     parser.add_argument("--port", type=int, default=8080, help="0 lets the system choose")
     parser.add_argument("--operator", default="operator", help="name stored with every intent")
     parser.add_argument("--cameras", nargs="*", default=("front", "wrist"), help="views to show, the first two of them")
