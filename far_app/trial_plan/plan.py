@@ -106,6 +106,17 @@ class TrialPlan:
         }  # fmt: skip
 
 
+def recorded(record: Mapping[str, Any], *, blind: bool) -> TrialPlan:
+    """A plan as a recording has it, as far as its order, its letters and its figures need it."""
+    return TrialPlan(
+        file=Path(), name=str(record["name"]), task=str(record["task"]), robot=str(record["robot"]),
+        methods=tuple(PlannedMethod(name=m["name"], method=m["method"]) for m in record["methods"]),
+        scenes=tuple(Scene(name=s["name"], seed=int(s["seed"])) for s in record["scenes"]),
+        repetitions=int(record["repetitions"]), seed=int(record["seed"]), blind=blind,
+        precision=float(record["precision"]),
+    )  # fmt: skip
+
+
 def changed(plan: TrialPlan, before: Mapping[str, Any]) -> list[str]:
     """Keys in which a plan differs from a recorded one so that their trials cannot be counted together. Scenes and
     repetitions may be added; precision, match and blinding say nothing of a trial."""

@@ -69,7 +69,10 @@ def _name(top: _Table, usual: str) -> str:
 def _method(table: _Table, known: Sequence[str]) -> PlannedMethod:
     method = table.choice("method", known)
     retry = table.value("retry", dict, {})
-    from_table(RetryConfig, retry, table.at("retry"))
+    try:
+        from_table(RetryConfig, retry, "")
+    except ConfigError as error:
+        raise ConfigError(f"{table.at('retry')}{'' if str(error).startswith(('.', ':')) else ': '}{error}") from error
     return PlannedMethod(
         name=_name(table, method), method=method, policy=table.policy(), critic=table.file("critic"),
         settings=table.choice("settings", ("model", "paper"), "model"), retry=retry,

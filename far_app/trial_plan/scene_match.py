@@ -4,7 +4,7 @@
     2. The reference is put into the live light: gain and offset of each colour by least absolute deviations over the
        pixels that are neither black nor saturated in either, so that what moved does not pull the fit.
     3. A pixel differs when it lies outside the range of the other's 3 × 3 surroundings (either way) by more than
-       TOLERANCE grey levels and four times the usual difference: one pixel of shift is forgiven.
+       TOLERANCE grey levels and four times the usual difference (at most NOISE): one pixel of shift is forgiven.
     4. Specks are dropped; share = what is left over all pixels;  score = 1 / (1 + share / HALF).
 
 So 1 is "nothing is out of place", ½ is HALF of the picture differing (a cube moved by its own width), and it falls on
@@ -26,6 +26,8 @@ SIDE = 160
 """Pixels of the longer side that are compared."""
 TOLERANCE = 16.0
 """Grey levels of 255."""
+NOISE = 40.0
+"""Grey levels; where half of the picture differs by more, that is no noise."""
 HALF = 0.004
 """Share of the picture that halves the score."""
 SPECK = 5
@@ -46,7 +48,7 @@ def score(reference: Picture, live: Picture) -> float:
     """Of one camera, 0 to 1, by the rule above. RGB; another size of the live picture is brought to the reference's."""
     differing = difference(reference, live)
     usual = 4 * 1.4826 * float(np.median(differing))
-    mask = (differing > max(TOLERANCE, usual)).astype(np.uint8)
+    mask = (differing > min(max(TOLERANCE, usual), NOISE)).astype(np.uint8)
     _, _, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     areas = stats[1:, cv2.CC_STAT_AREA]
     share = float(areas[areas >= SPECK].sum()) / mask.size
