@@ -128,8 +128,8 @@ def before_and_after(before: Sequence[Mapping[str, Any]], after: Sequence[Mappin
     gained, lost = sum(now[s] and not was[s] for s in scenes), sum(was[s] and not now[s] for s in scenes)
     span = f" [{100 * max(-1.0, low):+.1f}, {100 * min(1.0, high):+.1f}]" if high > low and len(scenes) > 1 else ""
     return (
-        f"after − before on the same {len(scenes)} scenes: {100 * mean:+.1f} points{span}; {gained} gained, {lost} lost, "
-        f"exact McNemar p = {mcnemar(gained, lost):.3g}"
+        f"after − before on the same {len(scenes)} scenes: {100 * mean:+.1f} points{span}; {gained} gained, {lost} "
+        f"lost, exact McNemar p = {mcnemar(gained, lost):.3g}"
     )
 
 

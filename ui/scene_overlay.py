@@ -76,7 +76,7 @@ def words(scene: SceneShown) -> str:
 def sheet(
     reference: Mapping[str, bytes], live: Mapping[str, bytes], blend: float, tile: int = TILE
 ) -> UInt8[np.ndarray, "H W 3"] | None:
-    """A row for each camera: start image, live over it, difference. RGB; None where there is nothing to hold against."""
+    """A row for each camera: start image, live over it, difference. RGB; None where there is no start image."""
     rows = []
     for camera, png in list(reference.items())[:ROWS]:
         start, now = picture(png), picture(live.get(camera, b""))

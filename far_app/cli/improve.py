@@ -83,8 +83,8 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def check_sessions(options: ImproveOptions, policy: Path) -> None:
-    """ConfigError, before the first evaluation takes its minutes, where sessions hold nothing to learn from, pictures of
-    another size than the policy's, or scenes that the evaluation is about to judge on."""
+    """ConfigError, before the first evaluation takes its minutes, where sessions hold nothing to learn from, pictures
+    of another size than the policy's, or scenes that the evaluation is about to judge on."""
     from far_app.learning.policy import load_policy
     from far_app.recording.episodes import session_episodes
     from far_app.recording.reader import read_session

@@ -85,7 +85,7 @@ def test_an_impossible_real_scene_is_refused_by_name(what: str, tmp_path: Path):
 
 def test_a_rig_without_cameras_can_show_no_picture(tmp_path: Path):
     (tmp_path / "here.png").write_bytes(b"")
-    with pytest.raises(ConfigError, match="camera is None.*the rig has no cameras"):
+    with pytest.raises(ConfigError, match=r"camera is None.*the rig has no cameras"):
         read(tmp_path, REAL + 'image = "here.png"\n', "xarm")
 
 
