@@ -66,10 +66,10 @@ def words(scene: SceneShown) -> str:
         tone = "good" if scene.score is not None and scene.score >= scene.limit else "warn"
         scores = " · ".join(f"{camera} {score:.2f}" for camera, score in scene.scores.items())
         text = f"match {scores} (limit {scene.limit:.2f}): {'it matches' if tone == 'good' else 'not yet'}"
+    heads = "<p><span>start image</span><span>live over it</span><span>difference</span></p>" * bool(scene.reference)
     return (
         f'<div class="far-card far-scene tone-{tone}" id="op-scene" data-tone="{tone}"><h2>Scene {escape(scene.name)} '
-        f"<em>{escape(text)}</em></h2><p><span>start image</span><span>live over it</span><span>difference</span></p>"
-        "</div>"
+        f"<em>{escape(text)}</em></h2>{heads}</div>"
     )
 
 

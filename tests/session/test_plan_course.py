@@ -1,5 +1,5 @@
-"""A plan in the real session: the right method on the right scene, told by letters, recorded in truth; what did not count
-comes again; after a stop nothing goes on by itself; a real scene is held against its start image."""
+"""A plan in the real session: the right method on the right scene, told by letters, recorded in truth; what did not
+count comes again; after a stop nothing goes on by itself; a real scene is held against its start image."""
 
 from __future__ import annotations
 
