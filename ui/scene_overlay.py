@@ -1,7 +1,7 @@
-"""Building a real scene again: its start image, the live camera over it, and where they differ, for each camera.
+"""Building a real scene again: the live camera over its start image, and where the two differ, for each camera.
 
-Shown while a plan waits for a scene. The slider says how much of the live picture covers the start image. What is
-marked as different is what the score counts (far_app/trial_plan/scene_match.py).
+Shown while a plan waits for a scene. The slider says how much of the live picture covers the start image: at 0 that one
+is seen alone. What is marked as different is what the score counts (far_app/trial_plan/scene_match.py).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from far_app.trial_plan.scene_match import TOLERANCE, difference
 from far_app.trial_plan.shown import SceneShown
 from ui.page_server import Presses
 
-TILE = 240
+TILE = 320
 """Pixels of each picture's side."""
 ROWS = 2
 """Cameras that fit."""
@@ -47,7 +47,7 @@ class SceneOverlay:
         self._words.visible = scene is not None
         drawn = None
         if scene is not None:
-            self._words.content = words(scene)
+            self._words.content = words(scene, telemetry.refusal if telemetry is not None else "")
             drawn = sheet(scene.reference, view.jpegs if view is not None else {}, self._blend)
         for part in (self._slot, self._picture, self._label, self._slider):
             part.visible = drawn is not None
@@ -55,8 +55,8 @@ class SceneOverlay:
             self._picture.image = drawn
 
 
-def words(scene: SceneShown) -> str:
-    """How well it matches, by camera."""
+def words(scene: SceneShown, refusal: str = "") -> str:
+    """How well it matches, by camera, and why the last Scene ready was not taken."""
     if not scene.reference:
         text, tone = (
             "first trial on this scene: build it, its start is kept and later trials are held against it",
@@ -66,17 +66,18 @@ def words(scene: SceneShown) -> str:
         tone = "good" if scene.score is not None and scene.score >= scene.limit else "warn"
         scores = " · ".join(f"{camera} {score:.2f}" for camera, score in scene.scores.items())
         text = f"match {scores} (limit {scene.limit:.2f}): {'it matches' if tone == 'good' else 'not yet'}"
-    heads = "<p><span>start image</span><span>live over it</span><span>difference</span></p>" * bool(scene.reference)
+    heads = "<p><span>live over start image</span><span>difference</span></p>" * bool(scene.reference)
+    why = f'<p class="why">{escape(refusal)}</p>' if refusal else ""
     return (
         f'<div class="far-card far-scene tone-{tone}" id="op-scene" data-tone="{tone}"><h2>Scene {escape(scene.name)} '
-        f"<em>{escape(text)}</em></h2>{heads}</div>"
+        f"<em>{escape(text)}</em></h2>{heads}{why}</div>"
     )
 
 
 def sheet(
     reference: Mapping[str, bytes], live: Mapping[str, bytes], blend: float, tile: int = TILE
 ) -> UInt8[np.ndarray, "H W 3"] | None:
-    """A row for each camera: start image, live over it, difference. RGB; None where there is no start image."""
+    """A row for each camera: live over its start image, difference. RGB; None where there is no start image."""
     rows = []
     for camera, png in list(reference.items())[:ROWS]:
         start, now = picture(png), picture(live.get(camera, b""))
@@ -98,7 +99,7 @@ def _row(start: np.ndarray, now: np.ndarray, blend: float, tile: int) -> UInt8[n
     differing = cv2.resize(difference(start, now), (tile, height), interpolation=cv2.INTER_NEAREST)
     grey = cv2.cvtColor(here, cv2.COLOR_RGB2GRAY)[..., None].astype(float) * 0.6 + 30.0
     share = np.clip(differing / (2 * TOLERANCE), 0.0, 1.0)[..., None] * (differing > TOLERANCE)[..., None]
-    return side_by_side((there, over, (grey * (1.0 - share) + _RED * share).astype(np.uint8)))
+    return side_by_side((over, (grey * (1.0 - share) + _RED * share).astype(np.uint8)))
 
 
 def side_by_side(pictures: Sequence[np.ndarray]) -> UInt8[np.ndarray, "H W 3"]:

@@ -82,9 +82,12 @@ def planned(options: TrialsOptions) -> tuple[TrialPlan, TrialsOptions]:
     options = dataclasses.replace(
         options, task=plan.task, max_attempts=plan.max_attempts, rerun=options.rerun and not plan.blind
     )
-    for number, method in enumerate(plan.methods, 1):
+    found = [
         settings(plan, method, options, f"{plan.file}: method[{number}].retry")
-    return plan, options
+        for number, method in enumerate(plan.methods, 1)
+    ]
+    learning = next((i for i, m in enumerate(plan.methods) if METHODS[m.method].needs_critic), 0)
+    return plan, dataclasses.replace(options, retry=found[learning])  # what-if on the recording begins from these
 
 
 def settings(plan: TrialPlan, method: PlannedMethod, options: RunOptions, where: str) -> RetryConfig:
