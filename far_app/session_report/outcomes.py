@@ -10,6 +10,9 @@ from far_app.recording.schema import LogEntry
 from far_app.session_states import Intent
 from far_app.statistics import mcnemar, paired_difference, wilson
 
+APART = ("reduced_speed", "taken_over")
+"""Events that leave their trial out of every figure: it was not the method's own doing alone."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Compared:
@@ -42,7 +45,7 @@ class Group:
     max_attempts: int
     trials: tuple[TrialOutcome, ...]
     unfinished: int
-    """Trials that were skipped, cut off, begun at reduced speed or not yet over: in no figure."""
+    """Trials that were skipped, cut off, begun at reduced speed, helped or not yet over: in no figure."""
 
     def solved(self, attempts: int) -> list[bool]:
         return [t.solved_by is not None and t.solved_by <= attempts for t in self.trials]
@@ -107,11 +110,11 @@ def _compared(session: SessionRecording, started: LogEntry, names: Mapping[str, 
 
 def ended_trials(session: SessionRecording) -> list[TrialOutcome]:
     """Trials that ended by themselves, under the last word on each attempt; not those that were skipped, cut off, begun
-    at reduced speed or are not yet over."""
+    at reduced speed, helped by a person, or are not yet over."""
     started = {e.trial: e.detail for e in session.log if e.event == "trial_started"}
-    slow = {e.trial for e in session.log if e.event == "reduced_speed"}
+    apart = {e.trial for e in session.log if e.event in APART}
     skipped = {e.trial for e in session.log if e.event == "intent" and e.text == Intent.SKIP_TRIAL}
-    over = {e.trial for e in session.log if e.event == "trial_ended"} - slow
+    over = {e.trial for e in session.log if e.event == "trial_ended"} - apart
     ended = []
     for trial in sorted(over & set(started)):
         said = {attempt: o.success for (t, attempt), o in sorted(session.marks.items()) if t == trial}

@@ -144,7 +144,8 @@ def _success(found: Sequence[Group]) -> str:
         rows.append(_row([*cells, f"{np.mean(attempts):.2f}" if attempts else "–"]))
     head = ["method", "trials", "left out", *(f"within {k}" for k in range(1, last + 1)), "attempts a trial"]
     note = (
-        "Brackets: 95 % Wilson intervals. Left out, and in no figure: trials skipped, cut off, begun at reduced speed."
+        "Brackets: 95 % Wilson intervals. Left out, and in no figure: trials skipped, cut off, begun at reduced speed, "
+        "helped by a person."
     )
     return f'{_table(head, rows)}<p class="dim">{note}</p>'
 
