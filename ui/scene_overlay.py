@@ -66,7 +66,7 @@ def words(scene: SceneShown, refusal: str = "") -> str:
         tone = "good" if scene.score is not None and scene.score >= scene.limit else "warn"
         scores = " · ".join(f"{camera} {score:.2f}" for camera, score in scene.scores.items())
         text = f"match {scores} (limit {scene.limit:.2f}): {'it matches' if tone == 'good' else 'not yet'}"
-    heads = "<p><span>live over start image</span><span>difference</span></p>" * bool(scene.reference)
+    heads = "<p>left: live over start image · right: what differs, in red</p>" * bool(scene.reference)
     why = f'<p class="why">{escape(refusal)}</p>' if refusal else ""
     return (
         f'<div class="far-card far-scene tone-{tone}" id="op-scene" data-tone="{tone}"><h2>Scene {escape(scene.name)} '
