@@ -16,6 +16,7 @@ import os
 import re
 import secrets
 import socket
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
@@ -24,6 +25,9 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from far_app.errors import ConfigError
+
+Doors = Callable[[str], str | None]
+"""Name of a page beside this one to its address; None while it does not run."""
 
 SHORTEST = 16
 """Characters of a token at least."""
@@ -61,11 +65,22 @@ class Access:
             return ipaddress.ip_address(self.address).is_loopback
         return False
 
+    @property
+    def name(self) -> str:
+        """What stands for the host in addresses; of a page on every address, this machine's name."""
+        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
+        return f"[{host}]" if ":" in host else host
+
     def url(self, port: int) -> str:
         """Where the page is, with the token where one is asked for: for those who may have it."""
-        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
-        base = f"http://{f'[{host}]' if ':' in host else host}:{port}"
+        base = f"http://{self.name}:{port}"
         return f"{base}/?token={self.token}" if self.token else base
+
+    def seen_from(self, url: str, host_header: str) -> str:
+        """An address of ours by the name under which somebody asked: theirs may be another than `name`."""
+        asked = urlsplit(f"//{host_header}").hostname or self.name
+        asked = f"[{asked}]" if ":" in asked else asked
+        return re.sub(rf"(//|%2F%2F){re.escape(self.name)}(:|%3A)", rf"\g<1>{asked}\g<2>", url)
 
     def listen(self, port: int) -> socket.socket:
         """A socket on exactly this address and port; 0 lets the system choose. Raises ConfigError."""
@@ -82,7 +97,9 @@ class Access:
             ) from error
         return listener
 
-    def answer(self, path: str, headers: Headers, port: int) -> tuple[http.HTTPStatus, str, dict[str, str]] | None:
+    def answer(
+        self, path: str, headers: Mapping[str, str], port: int
+    ) -> tuple[http.HTTPStatus, str, dict[str, str]] | None:
         """None to go on; else the status, words and headers to answer with. `path` as requested, with its query."""
         if not self._own(headers.get("Origin"), headers.get("Host", ""), port):
             return http.HTTPStatus.FORBIDDEN, "a page from elsewhere may not talk to this one", {}
@@ -103,9 +120,14 @@ class Access:
             return None
         return http.HTTPStatus.FORBIDDEN, "open the whole address that far run printed, token included", {}
 
-    def respond(self, request: Request, port: int) -> Response | None:
-        """`answer` for a websocket server, page and handshake alike."""
+    def respond(self, request: Request, port: int, doors: Doors) -> Response | None:
+        """`answer` for a websocket server, page and handshake alike; /go/NAME leads on to a page beside this one."""
         said = self.answer(request.path, request.headers, port)
+        if said is None and request.path.startswith("/go/"):
+            url = doors(request.path.removeprefix("/go/"))
+            said = http.HTTPStatus.NOT_FOUND, "it does not run now; go back", {}
+            if url is not None:
+                said = http.HTTPStatus.SEE_OTHER, "", {"Location": self.seen_from(url, request.headers.get("Host", ""))}
         if said is None:
             return None
         status, words, headers = said

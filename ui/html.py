@@ -106,12 +106,12 @@ def foot(gauges: tuple[Gauge, ...], refusal: str, viewer: str | None, session: s
         f'<span class="tone-{g.tone}"><i>{escape(g.label)}</i><b>{escape(g.value)}</b></span>' for g in gauges
     )
     link = (
-        f'<a href="{escape(viewer)}" target="_blank" rel="noreferrer">rerun viewer ↗</a>'
+        '<a href="/go/rerun" target="_blank" rel="noreferrer">rerun viewer ↗</a>'
         if viewer
         else '<a class="off">rerun off</a>'
     )
     if why:
-        link = f'<a href="{escape(why)}" target="_blank" rel="noreferrer">why did it fail ↗</a>' + link
+        link = '<a href="/go/why" target="_blank" rel="noreferrer">why did it fail ↗</a>' + link
     said = f'<span class="far-refusal">{escape(refusal)}</span>' if refusal else ""
     items = f'{said}<div class="far-gauges">{items}</div><span class="far-session">{escape(session)}</span>{link}'
     return f'<div class="far-foot" id="op-loop">{items}</div>'

@@ -21,21 +21,22 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from far_app.errors import ConfigError
-from ui.access import Access
+from ui.access import Access, Doors
 from ui.presence import Presence
 
 MAX_MESSAGE = 2**18
 """Bytes a client may send at once; clicks and camera poses are far below."""
 
 
-def open_page(access: Access, port: int, presence: Presence) -> viser.ViserServer:
+def open_page(access: Access, port: int, presence: Presence, doors: Doors = lambda name: None) -> viser.ViserServer:
     """A running server on exactly this address, its connections watched by `presence`; give it Presses at once.
+    `doors`: where its links /go/NAME lead.
 
     Raises ConfigError when the port is taken."""
     listener = access.listen(port)
     bound = int(listener.getsockname()[1])
     logging.getLogger("websockets.server").setLevel(logging.ERROR)
-    with _serving(listener, bound, access, presence), contextlib.redirect_stdout(io.StringIO()):
+    with _serving(listener, bound, access, presence, doors), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=access.address, port=bound, verbose=False)
     if server.get_port() != bound:
         server.stop()
@@ -44,13 +45,13 @@ def open_page(access: Access, port: int, presence: Presence) -> viser.ViserServe
 
 
 @contextlib.contextmanager
-def _serving(listener: socket.socket, port: int, access: Access, presence: Presence) -> Iterator[None]:
+def _serving(listener: socket.socket, port: int, access: Access, presence: Presence, doors: Doors) -> Iterator[None]:
     """While a ViserServer starts, its websocket server gets our socket, our rules and our look at who is there."""
     original = websocket_server.serve
 
     def serve(handler: Any, host: Any = None, wanted: Any = None, *, process_request: Any, **kwargs: Any) -> Any:
         def answer(connection: ServerConnection, request: Request) -> Response | None:
-            refused = access.respond(request, port)
+            refused = access.respond(request, port, doors)
             return refused if refused is not None else process_request(connection, request)
 
         kwargs.update(sock=listener, process_request=answer, max_size=MAX_MESSAGE)

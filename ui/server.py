@@ -78,7 +78,8 @@ class Page:
         endpoints = Endpoints.in_folder(options.run_folder)
         access = Access.at(options.host, options.token)
         self._presence = Presence()
-        self._server = open_page(access, options.port, self._presence)
+        self._beside: dict[str, LiveViewer | LiveWhy] = {}
+        self._server = open_page(access, options.port, self._presence, self._door)
         self.url = access.url(self._server.get_port())
         listener = self._server._websock_server._server_thread
         if listener is not None and listener.native_id is not None:
@@ -89,11 +90,18 @@ class Page:
             self._server, self._stop_line, self._presence, self._latest, scene3d=options.scene3d,
             cameras=options.cameras,
         )  # fmt: skip
-        self._viewer = LiveViewer(options.run_folder, options.recordings) if options.rerun else None
-        self._why = LiveWhy(options.run_folder, options.recordings, options.operator)
+        at = ["--host", options.host, *(("--token", str(options.token)) if options.token is not None else ())]
+        self._viewer = LiveViewer(options.run_folder, options.recordings, at) if options.rerun else None
+        self._why = LiveWhy(options.run_folder, options.recordings, options.operator, at)
+        self._beside |= {"why": self._why, **({"rerun": self._viewer} if self._viewer is not None else {})}
         self._plots, self._texts, self._trails, self._beats = Every(1 / 5), Every(1 / 5), Every(1 / 5), Every(1 / 2)
         self._telling = Every(1 / 4)
         self._hw_seq = 0
+
+    def _door(self, name: str) -> str | None:
+        """Where the page's links lead; asked from the first moment on."""
+        beside = self._beside.get(name)
+        return beside.url if beside is not None else None
 
     def _latest(self) -> tuple[Telemetry | None, Freshness]:
         return self._feeds.telemetry.message, self._fresh()

@@ -75,7 +75,7 @@ class WhyPage:
         """What was refused for want of control, and why."""
         self._presses.refused = lambda what, why: self.refusals.put(f"{what} is refused: {why}")
         self._buttons: dict[Press, tuple[str, viser.GuiButtonHandle, viser.CommandHandle]] = {}
-        self._sliders: dict[Press, viser.GuiSliderHandle[Any]] = {}
+        self._sliders: list[tuple[Press, viser.GuiSliderHandle[Any]]] = []
         self._touched: dict[Press, float] = {}
         server.gui.configure_theme(dark_mode=True, brand_color=BRAND, show_logo=False, show_share_button=False)
         server.gui.set_panel_label("FAR: why did it fail")
@@ -96,6 +96,7 @@ class WhyPage:
         self._frames = gui.add_html(why_html.frames(None, 0, 0, False))
         gui.add_html(why_html.key())
         self._charts = gui.add_html(why_html.charts(None, 0))
+        self._add_slider(Press.TICK, "", 0, 150, 1, slot="pick")  # unseen, over the charts: a click or a drag there
         self._numbers = gui.add_html(why_html.numbers(None, None, 0, ""))
         self._foot = gui.add_html(why_html.foot("", (), "", ""))
         gui.add_html(f"<style>{_STYLE}\n@media (min-width: 768px) {{ {' '.join(places)} }}</style>")
@@ -109,16 +110,16 @@ class WhyPage:
         self._presses.on(command, lambda: self.events.put((press, 0.0)))
         self._buttons[press] = (label, handle, command)
         return (
-            f'div:has(> [id="{handle._impl.uuid}"]) {{ left: calc({(0.7, 11.15)[column]} * var(--u)); '
-            f"width: calc(9.9 * var(--u)); top: calc(var(--head) + {0.7 + 4.35 * row} * var(--u)); "
+            f'div:has(> [id="{handle._impl.uuid}"]) {{ left: calc({(0.7, 11.6)[column]} * var(--u)); '
+            f"width: calc(10.2 * var(--u)); top: calc(var(--head) + {0.7 + 4.35 * row} * var(--u)); "
             f"height: calc(3.85 * var(--u)); }}"
         )
 
-    def _add_slider(self, press: Press, label: str, low: float, high: float, step: float) -> None:
-        self._gui.add_html(f'<div class="why-slot slot-{press.value}">{label}</div>')
+    def _add_slider(self, press: Press, label: str, low: float, high: float, step: float, slot: str = "") -> None:
+        self._gui.add_html(f'<div class="why-slot slot-{slot or press.value}">{label}</div>')
         slider = self._gui.add_slider(" ", min=low, max=high, step=step, initial_value=low)
         self._presses.on_value(slider, lambda value: self._slid(press, value))
-        self._sliders[press] = slider
+        self._sliders.append((press, slider))
 
     def _slid(self, press: Press, value: float) -> None:
         self._touched[press] = time.monotonic()
@@ -159,11 +160,10 @@ class WhyPage:
         values = {
             Press.TICK: s.looking.tick, Press.RHO: s.looking.choice.rho, Press.HORIZON: s.looking.choice.horizon,
         }  # fmt: skip
-        tick = self._sliders[Press.TICK]
-        if tick.max != last:
-            tick.value = min(tick.value, last)
-            tick.max = last
-        for press, slider in self._sliders.items():
+        for press, slider in self._sliders:
+            if press is Press.TICK and slider.max != last:
+                slider.value = min(slider.value, last)
+                slider.max = last
             settled = time.monotonic() - self._touched.get(press, 0.0) > _SETTLE
             if settled and slider.value != values[press]:
                 slider.value = values[press]

@@ -69,6 +69,8 @@ class View:
                 self._pressed(*self._page.events.get_nowait())
         except queue.Empty:
             pass
+        while not self._page.refusals.empty():
+            self._said = self._page.refusals.get_nowait()
         self._asking.hear()
         self._refresh()
         self._case = self._read()

@@ -20,6 +20,7 @@ from far_app.errors import RecordingError
 from far_app.recording.append_file import being_written
 from far_app.recording.codec import Json, decode
 from far_app.recording.images import LazyImages, decode_png
+from far_app.recording.migrations import migrated, readable
 from far_app.recording.scan import Scan, scan
 from far_app.recording.schema import (
     CAMERA_TOPIC,
@@ -129,7 +130,7 @@ class SessionRecording:
 def read_session(path: Path) -> SessionRecording:
     """Raises RecordingError when the folder holds no session or one of another schema."""
     header = _read_header(path)
-    log, problems = _read_log(path / TRIALS_FILE)
+    log, problems = _read_log(path / TRIALS_FILE, header.schema_version)
     return SessionRecording(
         path=path, header=header, log=tuple(log), files=tuple(sorted(path.glob("trial_*/attempt_*.mcap"), key=_order)),
         live=being_written(path / TRIALS_FILE), problems=tuple(problems),
@@ -140,8 +141,6 @@ def read_attempt(path: Path) -> AttemptRecording:
     """Raises RecordingError when there is no such file, it is not MCAP, or it is of another schema."""
     found = scan(path)
     parts = _Parts(path, found)
-    if parts.header is not None and parts.header.schema_version != SCHEMA_VERSION:
-        raise RecordingError(_other_version(path, parts.header.schema_version))
     return parts.recording()
 
 
@@ -160,6 +159,11 @@ class _Parts:
         self._by_topic: dict[str, list[Message]] = {}
         for topic, message in self.found.messages:
             self._by_topic.setdefault(topic, []).append(message)
+        self._version = SCHEMA_VERSION  # of a file whose header is lost: what it lacks reads as the defaults
+        for body in self._bodies("/attempt"):
+            if isinstance(body, dict) and "schema_version" in body:
+                self._version = readable(body["schema_version"], self.path)
+                break
         headers = self._values("/attempt", AttemptHeader)
         self.header = headers[0] if headers else None
         self._frames = {
@@ -216,8 +220,8 @@ class _Parts:
         bodies = []
         for message in self._by_topic.get(topic, []):
             try:
-                bodies.append(json.loads(message.data))
-            except ValueError:
+                bodies.append(migrated(topic, json.loads(message.data), self._version))
+            except (ValueError, KeyError, TypeError, AttributeError):
                 self._unreadable += 1
         return bodies
 
@@ -233,7 +237,7 @@ class _Parts:
     def _step(self, message: Message) -> Step | None:
         what = f"{self.path} /step {message.sequence}"
         try:
-            body = json.loads(message.data)
+            body = migrated("/step", json.loads(message.data), self._version)
             images = self._images(body["observation"].pop("frames"))
             step = decode(Step, body, what)
         except (ValueError, KeyError, TypeError, AttributeError, RecordingError):
@@ -274,12 +278,11 @@ def _read_header(path: Path) -> SessionHeader:
         raise RecordingError(f"{file} cannot be read: {error}") from error
     if not isinstance(body, dict) or body.get("schema") != SCHEMA_NAME:
         raise RecordingError(f"{file} is not a recording of this program (schema is not '{SCHEMA_NAME}')")
-    if body.get("schema_version") != SCHEMA_VERSION:
-        raise RecordingError(_other_version(path, body.get("schema_version")))
-    return decode(SessionHeader, body, str(file))
+    version = readable(body.get("schema_version"), path)
+    return decode(SessionHeader, migrated(SESSION_FILE, body, version), str(file))
 
 
-def _read_log(file: Path) -> tuple[list[LogEntry], list[str]]:
+def _read_log(file: Path, version: int) -> tuple[list[LogEntry], list[str]]:
     try:
         lines = file.read_bytes().split(b"\n")
     except OSError as error:
@@ -288,17 +291,10 @@ def _read_log(file: Path) -> tuple[list[LogEntry], list[str]]:
     entries = []
     for number, line in enumerate(lines[:-1], start=1):
         try:
-            entries.append(decode(LogEntry, json.loads(line), file.name))
-        except (ValueError, RecordingError) as error:
+            entries.append(decode(LogEntry, migrated(TRIALS_FILE, json.loads(line), version), file.name))
+        except (ValueError, KeyError, TypeError, AttributeError, RecordingError) as error:
             problems.append(f"line {number} of {file.name} is damaged: {error}")
     return entries, problems
-
-
-def _other_version(path: Path, version: object) -> str:
-    return (
-        f"{path} was recorded with schema version {version}, this program reads version {SCHEMA_VERSION}; "
-        "open it with the program's version named in its session.json (code_version)"
-    )
 
 
 def _order(file: Path) -> tuple[int, int, str]:

@@ -15,8 +15,9 @@ from far_app.recording.codec import Json, codec
 from far_app.types import ActionChunk, Adaptation, AdaptationStep, Observation, Outcome, Step
 
 SCHEMA_NAME = "far-recording"
-SCHEMA_VERSION = 1
-"""Rises when an older reader would misread a newer file; a field added with a default does not raise it."""
+SCHEMA_VERSION = 2
+"""Rises when an older reader would misread a newer file; a field added with a default does not raise it by itself.
+Older files are read through migrations.py, which also says what each version brought."""
 
 SESSION_FILE = "session.json"
 TRIALS_FILE = "trials.jsonl"
