@@ -54,7 +54,11 @@ class Camera:
         self.page.goto(url)
 
     def until(self, selector: str) -> None:
-        self.page.wait_for_selector(selector, timeout=PATIENCE)
+        try:
+            self.page.wait_for_selector(selector, timeout=PATIENCE)
+        except Error as error:
+            shown = self.page.inner_text(".far-head").split("\n")
+            raise SystemExit(f"{selector} never came; the page shows {shown}") from error
 
     def state(self, word: str, more: str = "") -> None:
         self.until(f"#op-state[data-state='{word}']{more}")
@@ -71,11 +75,12 @@ class Camera:
 
 def twin(browser: Any, recordings: Path) -> None:
     """A session on the twin, from its start to the loss of the page."""
-    words = ("run", "--trials", "2", "--seed", "7", "--port", "0", "--no-rerun", "--recordings", str(recordings))
+    words = ("run", "--trials", "9", "--seed", "7", "--port", "0", "--no-rerun", "--recordings", str(recordings))
     with program(*words) as (process, url):
         camera = Camera(browser, url)
-        camera.until("#op-state:not([data-state='WAITING'])")
-        camera.take("start", settle=3.0)
+        camera.press("Skip trial")  # a browser that draws in software comes up in the middle of the first one
+        camera.state("GOING HOME")
+        camera.take("start", settle=0.5)
         camera.until("#op-state[data-state='RUNNING'][data-attempt='1']")
         camera.take("running", settle=2.5)
         camera.page.keyboard.press("p")
@@ -186,7 +191,10 @@ def main(parts: list[str]) -> int:
         return 2
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="far-screens-") as recordings, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        last = Path(recordings) / "chromium"  # draws in software here: it must not take the cores from the loop
+        last.write_text(f'#!/bin/sh\nexec nice -n 15 {CHROMIUM} "$@"\n')
+        last.chmod(0o755)
+        browser = playwright.chromium.launch(executable_path=str(last), args=ARGUMENTS)
         for part in parts or PARTS:
             PARTS[part](browser, Path(recordings))
         browser.close()

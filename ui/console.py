@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import viser
@@ -19,12 +20,16 @@ from far_app.telemetry import Telemetry, View
 from far_app.types import RobotMode
 from ui import html
 from ui.keys import Page, add_hotkey, hint, key_of
+from ui.lineage import Lineage
+from ui.marks import Marks
 from ui.page_server import Presses
+from ui.panels import BLUE, Panels
 from ui.plots import Plots
 from ui.presence import Presence
 from ui.scene3d import BRAND, FLAGGED, Scene3D
 from ui.scene_overlay import SceneOverlay
 from ui.stop import StopLine
+from ui.take_over import TakeOver
 from ui.trials_panel import TrialsPanel
 from ui.view_model import Freshness, adaptation, arm_word, banner, control, loop_gauges, summary
 from ui.viewers import Live, Viewers
@@ -62,7 +67,9 @@ _BUTTONS = (
     _control(Intent.MARK_FAILURE, "Mark failure", _AMBER, 1, 1),
     _control(Intent.SKIP_TRIAL, "Skip trial", _QUIET, 0, 2),
     _control(Intent.SCENE_READY, "Scene ready", BRAND, 1, 2),
-    _Button(intent=Intent.QUIT, label="End session", color=_QUIET, box=(0.7, 26.4, 22.3, 3.3)),
+    _Button(intent=Intent.TAKE_OVER, label="Take over", color=BLUE, box=(0.7, 26.4, 10.85, 3.3)),
+    _Button(intent=Intent.HAND_BACK, label="Hand back", color=_AMBER, box=(0.7, 26.4, 10.85, 3.3)),
+    _Button(intent=Intent.QUIT, label="End session", color=_QUIET, box=(12.15, 26.4, 10.85, 3.3)),
 )
 
 
@@ -80,8 +87,8 @@ class Console:
         cameras: Sequence[str] = PLACES,
     ) -> None:
         self._cameras = cameras
-        self.pressed: queue.SimpleQueue[Intent] = queue.SimpleQueue()
-        """Intents that passed the guard, for the caller to send."""
+        self.pressed: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        """Intents and other words that passed the guard, for the caller to send."""
         self.refusal = ""
         """Why the page itself refused the last press."""
         self._gui, self._stop, self._latest = server.gui, stop_line, latest
@@ -118,10 +125,13 @@ class Console:
         self._events = gui.add_html(html.events((), 0.0))
         self._add_cameras()
         self.plots = Plots(gui)
+        self._panels = self._add_panels()
         self._plan, self._overlay = TrialsPanel(gui), SceneOverlay(gui, self._presses)
         self._foot = gui.add_html(html.foot((), "", None, ""))
         self._viewers = Viewers(self._server, self._presses, self._presence, Page.CONSOLE)
-        gui.add_html(f"<style>{_STYLE}\n@media (min-width: 768px) {{ {' '.join(places)} }}</style>")
+        gui.add_html(
+            f"<style>{_STYLE}\n@media (min-width: 768px) {{ {' '.join(places)} {self._panels.style} }}</style>"
+        )
 
     def _add_control(self, button: _Button) -> str:
         handle = self._gui.add_button(button.label, disabled=True, color=button.color)
@@ -136,6 +146,14 @@ class Console:
     def _hotkey(self, action: str, label: str, *, disabled: bool = False) -> viser.CommandHandle | None:
         key = key_of(Page.CONSOLE, action)
         return add_hotkey(self._gui, key, label, disabled=disabled) if key is not None else None
+
+    def _add_panels(self) -> Panels:
+        marks = Marks()
+        panels = Panels(
+            self._gui, self._presses, self._latest, self.pressed.put, self.refuse, (TakeOver(), marks, Lineage())
+        )  # fmt: skip
+        marks.add_field(self._gui, self._presses, panels)
+        return panels
 
     def _add_cameras(self) -> None:
         for camera, place in zip(self._cameras, PLACES, strict=False):
@@ -186,11 +204,13 @@ class Console:
     ) -> None:
         """Words, buttons, tables; viser sends only what changed. `viewer` is where rerun shows the session, `why` its
         attempt view."""
+        taken_over = telemetry is not None and telemetry.state is State.TAKEN_OVER
         status = view.status if view is not None and not fresh.hw_silent else None
-        self._head.content = html.head(banner(telemetry, fresh), arm_word(status))
+        self._head.content = html.head(banner(telemetry, fresh), arm_word(status, taken_over))
         latched = status is not None and status.mode is RobotMode.LATCHED
         self._stop_note.content = html.stop_note(self._stop.result, latched, status.reason if status else "")
-        self._show_controls(telemetry, fresh)
+        self._show_controls(telemetry, fresh, taken_over)
+        self._panels.show(telemetry)
         self._plan.show(telemetry)
         self._overlay.show(telemetry, view)
         self._adapt.content = html.adaptation(adaptation(telemetry))
@@ -202,13 +222,15 @@ class Console:
             refusal = refusal or telemetry.refusal
         self._foot.content = html.foot(gauges, refusal, viewer, session, why)
 
-    def _show_controls(self, telemetry: Telemetry | None, fresh: Freshness) -> None:
+    def _show_controls(self, telemetry: Telemetry | None, fresh: Freshness, taken_over: bool) -> None:
         live: list[Live] = []
         for intent, (button, handle, hotkey) in self._controls.items():
             now = control(intent, telemetry, fresh)
             line = self._hint(button, telemetry) if now.enabled else now.reason
             live.append(Live(button=handle, hotkey=hotkey, enabled=now.enabled, label=button.label, line=line))
-        self._viewers.show(live)
+        for intent, there in ((Intent.TAKE_OVER, not taken_over), (Intent.HAND_BACK, taken_over)):
+            self._controls[intent][1].visible = there
+        self._viewers.show([*live, *self._panels.live(telemetry, fresh)])
 
     def pictures(self, view: View) -> None:
         """The cameras' JPEGs as they came: no decoding and no encoding on the way to the browser."""

@@ -76,6 +76,7 @@ class Presses:
         self._presence, self._wire = presence, server._websock_server
         self._actions: dict[str, tuple[Callable[[int], None], bool, str]] = {}
         self._values: dict[str, tuple[viser.GuiSliderHandle[Any], Callable[[float], None]]] = {}
+        self._texts: dict[str, tuple[Callable[[str], None], int]] = {}
         self.refused: Callable[[str, str], None] = lambda what, why: None
         """Told of each press that was refused for want of control: its label, and why."""
         for kind in list(self._wire._incoming_handlers):
@@ -99,9 +100,15 @@ class Presses:
         """A slider; the action gets a finite number within its limits, whatever the client says."""
         self._values[handle._impl.uuid] = (handle, action)
 
+    def on_text(self, handle: viser.GuiInputHandle[str], write: Callable[[str], None], limit: int) -> None:
+        """A text field; `write` gets what it holds, at most `limit` characters."""
+        self._texts[handle._impl.uuid] = (write, limit)
+
     def _click(self, client: int, message: messages.GuiUpdateMessage) -> None:
         if message.uuid in self._values and set(message.updates) == {"value"}:
             self._slide(client, message.uuid, message.updates["value"])
+        elif message.uuid in self._texts and set(message.updates) == {"value"}:
+            self._type(client, message.uuid, message.updates["value"])
         elif message.updates == {"value": True}:
             self._act(client, message.uuid)
 
@@ -119,6 +126,11 @@ class Presses:
         if number and self._may(client, False, "a slider"):
             assert isinstance(value, int | float)
             move(float(min(max(value, handle.min), handle.max)))
+
+    def _type(self, client: int, uuid: str, value: object) -> None:
+        write, limit = self._texts[uuid]
+        if isinstance(value, str) and value.isprintable() and self._may(client, False, "a text field"):
+            write(value[:limit])
 
     def _may(self, client: int, everyone: bool, label: str) -> bool:
         if everyone or self._presence.holds(self._wire._live_connections.get(client)):

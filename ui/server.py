@@ -14,11 +14,16 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from far_app.endpoints import Endpoints
+from far_app.lineage import VersionWish
+from far_app.marks import MarkAttempt
+from far_app.recording.said_lines import now
 from far_app.session_states import Intent
+from far_app.take_over import Nudge
 from far_app.telemetry import Telemetry
 from ui.access import Access
 from ui.console import Console
@@ -153,12 +158,14 @@ class Page:
         """Wait for the next tick (monotonic seconds); what is pressed meanwhile goes to the app at once."""
         while True:
             try:
-                intent = self._console.pressed.get(timeout=max(0.0, until - time.monotonic()))
+                said = self._console.pressed.get(timeout=max(0.0, until - time.monotonic()))
             except queue.Empty:
                 return
-            if not self._feeds.send(intent, self._options.operator) and intent is not Intent.STOP:
-                log.warning("nobody takes the intent %s: is the app running?", intent.value)
-                self._console.refuse(intent.value, "the app did not take it; press again")
+            said = signed(said, self._options.operator)
+            if not self._feeds.send(said, self._options.operator) and said is not Intent.STOP:
+                what = said.value if isinstance(said, Intent) else type(said).__name__
+                log.warning("nobody takes the word %s: is the app running?", what)
+                self._console.refuse(what, "the app did not take it; press again")
 
     def close(self) -> None:
         self._why.close()
@@ -167,6 +174,13 @@ class Page:
         self._stop_line.close()
         self._feeds.close()
         self._server.stop()
+
+
+def signed(said: Any, by: str) -> Any:
+    """A word with who said it and when, where it carries that."""
+    if isinstance(said, MarkAttempt):
+        return replace(said, mark=replace(said.mark, by=by, wall=now()))
+    return replace(said, by=by) if isinstance(said, Nudge | VersionWish) else said
 
 
 def serve(options: PageOptions, ended: threading.Event) -> None:

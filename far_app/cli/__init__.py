@@ -30,6 +30,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "replay": ("far_app.cli.replay", "why did it fail: a recorded session in the attempt view, or in rerun"),
     "export": ("far_app.cli.export", "recorded attempts as a LeRobot, robomimic or rerun dataset"),
     "import": ("far_app.cli.import_demos", "robomimic or LeRobot demonstrations as ours"),
+    "mark": ("far_app.cli.mark", "your word on a recorded attempt: success, failure, unsure, a note"),
     "policy list": ("far_app.cli.policy_list", "the adapted policy versions a session kept, and their lineage"),
     "policy promote": ("far_app.cli.policy_promote", "an adapted version as a checkpoint of its own"),
     "bench loop": ("far_app.bench.loop", "lateness of the 30 Hz loop, idle and adapting"),

@@ -17,10 +17,13 @@ import numpy as np
 from mcap.records import Message
 
 from far_app.errors import RecordingError
+from far_app.marks import Mark, Verdict
 from far_app.recording.append_file import being_written
 from far_app.recording.codec import Json, decode
 from far_app.recording.images import LazyImages, decode_png
+from far_app.recording.marks import MARKS_FILE, marks_in
 from far_app.recording.migrations import migrated, readable
+from far_app.recording.said_lines import read_lines
 from far_app.recording.scan import Scan, scan
 from far_app.recording.schema import (
     CAMERA_TOPIC,
@@ -38,6 +41,7 @@ from far_app.types import (
     Adaptation,
     AdaptationStep,
     Attempt,
+    Judge,
     Observation,
     Outcome,
     Step,
@@ -110,6 +114,8 @@ class SessionRecording:
     live: bool
     """A living process is still writing."""
     problems: tuple[str, ...]
+    words: tuple[Mark, ...] = ()
+    """People's words on attempts, oldest first, those said after the session was closed included."""
 
     def attempts(self) -> Iterator[AttemptRecording]:
         """Every attempt, one at a time."""
@@ -118,22 +124,36 @@ class SessionRecording:
 
     @cached_property
     def marks(self) -> dict[tuple[int, int], Outcome]:
-        """(trial, attempt) to the last word said on it, marks made after its file was closed included."""
+        """(trial, attempt) to the last verdict on it, those given after its file was closed included; being unsure
+        changes none (see `unsure`)."""
         words = {}
         for entry in self.log:
             if entry.event in ("attempt_ended", "outcome_marked"):
                 known = {key: entry.detail.get(key) for key in ("success", "judged_by", "note")}
                 words[entry.trial, entry.attempt] = decode(Outcome, known, f"{self.path / TRIALS_FILE}: {entry.event}")
+        for word in self.words:
+            if word.verdict in (Verdict.SUCCESS, Verdict.FAILURE):
+                words[word.trial, word.attempt] = Outcome(
+                    success=word.verdict is Verdict.SUCCESS, judged_by=Judge.OPERATOR, note=word.note
+                )
         return words
+
+    @cached_property
+    def unsure(self) -> frozenset[tuple[int, int]]:
+        """(trial, attempt) of which a person said last that it is not sure how it went."""
+        last = {(word.trial, word.attempt): word.verdict for word in self.words if word.verdict is not None}
+        return frozenset(key for key, verdict in last.items() if verdict is Verdict.UNSURE)
 
 
 def read_session(path: Path) -> SessionRecording:
     """Raises RecordingError when the folder holds no session or one of another schema."""
     header = _read_header(path)
     log, problems = _read_log(path / TRIALS_FILE, header.schema_version)
+    afterwards, cut = read_lines(path / MARKS_FILE)
+    words, damaged = marks_in([*log, *afterwards])
     return SessionRecording(
         path=path, header=header, log=tuple(log), files=tuple(sorted(path.glob("trial_*/attempt_*.mcap"), key=_order)),
-        live=being_written(path / TRIALS_FILE), problems=tuple(problems),
+        live=being_written(path / TRIALS_FILE), problems=(*problems, *cut, *damaged), words=tuple(words),
     )  # fmt: skip
 
 

@@ -50,6 +50,9 @@ class Assignment:
 
 
 class Course(Protocol):
+    fixed: str
+    """Why the operator may not choose the policy's versions; "" when they may."""
+
     def next(self) -> Assignment | None:
         """The trial to run; None when there is no more. Asked while the arm stands."""
         ...
@@ -65,6 +68,8 @@ class Course(Protocol):
 
 class Consecutive:
     """The next seed each time, under one method."""
+
+    fixed = ""
 
     def __init__(self, method: Method, *, seed: int, trials: int) -> None:
         """`trials` 0: without end."""

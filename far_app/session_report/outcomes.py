@@ -45,7 +45,8 @@ class Group:
     max_attempts: int
     trials: tuple[TrialOutcome, ...]
     unfinished: int
-    """Trials that were skipped, cut off, begun at reduced speed, helped or not yet over: in no figure."""
+    """Trials that were skipped, cut off, begun at reduced speed, helped by a person, marked unsure or not yet over: in
+    no figure."""
 
     def solved(self, attempts: int) -> list[bool]:
         return [t.solved_by is not None and t.solved_by <= attempts for t in self.trials]
@@ -110,9 +111,9 @@ def _compared(session: SessionRecording, started: LogEntry, names: Mapping[str, 
 
 def ended_trials(session: SessionRecording) -> list[TrialOutcome]:
     """Trials that ended by themselves, under the last word on each attempt; not those that were skipped, cut off, begun
-    at reduced speed, helped by a person, or are not yet over."""
+    at reduced speed, helped by a person, marked unsure, or are not yet over."""
     started = {e.trial: e.detail for e in session.log if e.event == "trial_started"}
-    apart = {e.trial for e in session.log if e.event in APART}
+    apart = {e.trial for e in session.log if e.event in APART} | {trial for trial, _ in session.unsure}
     skipped = {e.trial for e in session.log if e.event == "intent" and e.text == Intent.SKIP_TRIAL}
     over = {e.trial for e in session.log if e.event == "trial_ended"} - apart
     ended = []

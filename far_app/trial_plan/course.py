@@ -36,6 +36,8 @@ class Equipped:
 class PlanCourse:
     """far_app.session.course.Course."""
 
+    fixed = "in a plan every trial begins with its method's own policy"
+
     def __init__(
         self,
         plan: TrialPlan,
@@ -49,14 +51,19 @@ class PlanCourse:
         """`earlier`: the plan's sessions before this one, which records to `folder`. `tell` hears after every trial."""
         self.plan, self._equipped, self._references, self._tell = plan, equipped, references, tell
         self._earlier, self._folder = done_in(earlier), folder
-        self._here: dict[Slot, TrialOutcome] = {}
-        """This session's, until the disk has them."""
+        self._newest: dict[Slot, TrialOutcome] = {}
+        """The trial that has just ended, until the disk has it."""
+        self._ended = 0
+        """Trials of this session."""
         self._teller = Teller(plan=plan, attempts={name: e.max_attempts for name, e in equipped.items()})
         self._scenes = {scene.name: scene for scene in plan.scenes}
         self._now: Slot | None = None
         self._queue = deque(slot for slot in slots(plan) if slot not in self._earlier)
 
     def next(self) -> Assignment | None:
+        done = self._done()
+        taken_back = (slot for slot in slots(self.plan) if slot not in done and slot not in self._queue)
+        self._queue.extend(taken_back)  # marked unsure since
         self._now = self._queue.popleft() if self._queue else None
         if self._now is None:
             return None
@@ -76,10 +83,11 @@ class PlanCourse:
     def ended(self, assignment: Assignment, result: TrialResult) -> None:
         slot = self._now
         assert slot is not None, "a trial that ended was given out by next()"
-        self._now = None
+        self._now, self._newest = None, {}
+        self._ended += 1
         if result.finished and result.counted:
-            self._here[slot] = TrialOutcome(
-                session=self._folder.name, trial=0, scene=result.seed, attempts=result.attempts,
+            self._newest[slot] = TrialOutcome(
+                session=self._folder.name, trial=self._ended, scene=result.seed, attempts=result.attempts,
                 solved_by=result.attempts if result.success else None, repetition=slot.repetition,
             )  # fmt: skip
         else:
@@ -90,9 +98,11 @@ class PlanCourse:
         return self._teller.shown(self._done(), self._now)
 
     def _done(self) -> dict[Slot, TrialOutcome]:
-        """The disk's word first: it has the marks that were made since."""
+        """The disk's word as soon as it has one: it has the marks that were made since."""
         try:
-            here = done_in([read_session(self._folder)])
+            session = read_session(self._folder)
         except RecordingError:
-            here = {}
-        return {**self._here, **here, **self._earlier}
+            return {**self._newest, **self._earlier}
+        written = sum(entry.event == "trial_ended" for entry in session.log)
+        newest = self._newest if written < self._ended else {}
+        return {**newest, **done_in([session]), **self._earlier}

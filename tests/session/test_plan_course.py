@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from far_app.lineage import VersionWish, Wish
+from far_app.marks import Mark, MarkAttempt, Verdict
 from far_app.protocols import Reset
 from far_app.recording.reader import read_session
 from far_app.recording.schema import SessionInfo
@@ -93,6 +95,26 @@ def test_a_trial_that_was_skipped_comes_again_at_the_end(tmp_path: Path):
     ran = [(d["method"], d["scene"]) for d in desk.started()]
     first = (slots(ab)[0].method, slots(ab)[0].scene)
     assert len(ran) == 5 and ran[0] == ran[-1] == first and desk.told[-1].done == 4
+
+
+def test_a_trial_that_a_person_is_unsure_of_comes_again(tmp_path: Path):
+    ab = plan(scenes=seeded((7, 8)))
+    desk = Sitting(tmp_path, ab, headless=False, horizon=60)
+
+    def unsure() -> None:
+        mark = Mark(trial=1, attempt=1, verdict=Verdict.UNSURE, by="me")
+        desk.inbox.say(MarkAttempt(session="test", mark=mark))
+
+    desk.when(lambda: len(desk.session.results) == 2 and desk.moving(), unsure)
+    desk.session.run()
+    ran = [(d["method"], d["scene"]) for d in desk.started()]
+    assert len(ran) == 5 and ran[-1] == ran[0] and desk.told[-1].done == 4
+
+
+def test_in_a_plan_nobody_chooses_the_policys_versions(tmp_path: Path):
+    desk = Sitting(tmp_path, plan(scenes=seeded((7,))))
+    assert "in a plan every trial begins with its method's own policy" in desk.session.versions.told().unavailable
+    assert desk.session.versions.refusal(VersionWish(wish=Wish.KEEP, version="base"))
 
 
 def test_a_plan_goes_on_in_another_session_with_what_is_left(tmp_path: Path):
