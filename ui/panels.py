@@ -47,7 +47,9 @@ class Panel(Protocol):
     title: str
     height: float
     """Page units."""
-    items: Sequence[Item]
+
+    @property
+    def items(self) -> Sequence[Item]: ...
 
     def html(self, telemetry: Telemetry | None) -> str:
         """Its words, above and between the buttons."""
