@@ -141,9 +141,10 @@ class OperatorIntent:
 @register
 @dataclass(frozen=True, kw_only=True)
 class PagePresence:
-    """From the page to the app, several times a second: somebody has it open, or nobody has."""
+    """From the page to the app, several times a second: somebody who may act has it open, or nobody has."""
 
     clients: int
+    """1 while the viewer who holds control answers, else 0."""
 
 
 @register

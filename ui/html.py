@@ -14,6 +14,8 @@ from ui.view_model import AdaptationCard, Banner, Freshness, Gauge, Tone
 
 HISTORY_ROWS = 40
 LOG_LINES = 30
+ONE_COLUMN = 13
+"""Keys that fit below each other; more of them stand in two columns."""
 
 
 def head(banner: Banner, arm: tuple[str, Tone]) -> str:
@@ -118,12 +120,11 @@ def foot(gauges: tuple[Gauge, ...], refusal: str, viewer: str | None, session: s
 
 
 def keys(page: Page, shown: bool) -> str:
-    """The list on `?`, from the keys table; "" hides it."""
-    rows = "".join(
-        f"<tr><td><kbd>{escape(key.cap)}</kbd></td><td>{escape(key.does)}</td></tr>" for key in keys_of(page)
-    )
+    """The list on `?`, from the keys table; not shown it is empty."""
+    rows = "".join(f"<p><kbd>{escape(k.cap)}</kbd><span>{escape(k.does)}</span></p>" for k in keys_of(page))
     note = "Keys do nothing while a text field has the focus. ? closes this list."
-    body = f"<div><h2>Keys</h2><table>{rows}</table><p>{note}</p></div>" if shown else ""
+    many = ' class="many"' if len(keys_of(page)) > ONE_COLUMN else ""
+    body = f"<div><h2>Keys</h2><section{many}>{rows}</section><footer>{note}</footer></div>" if shown else ""
     return f'<div class="far-keys{" on" if shown else ""}" id="op-keys">{body}</div>'
 
 

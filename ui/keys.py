@@ -61,7 +61,7 @@ def _why(action: str, hotkey: str, does: str, modifier: str | None = None) -> Ke
 
 
 KEYS = (
-    _console(Intent.STOP, "space", "STOP: latch the arm at once, from any page"),
+    _console(Intent.STOP, "space", "STOP: latch the arm at once"),
     _console(Intent.PAUSE, "P", "pause the attempt or the way home; cancels a countdown"),
     _console(Intent.RESUME, "R", "resume after a pause; after a stop or a fault, click it"),
     _console(Intent.MARK_SUCCESS, "S", "mark the attempt a success"),

@@ -83,6 +83,7 @@ class Page:
         endpoints = Endpoints.in_folder(options.run_folder)
         access = Access.at(options.host, options.token)
         self._presence = Presence()
+        self._beside: dict[str, LiveViewer | LiveWhy] = {}
         self._server = open_page(access, options.port, self._presence, self._door)
         self.url = access.url(self._server.get_port())
         listener = self._server._websock_server._server_thread
@@ -97,13 +98,15 @@ class Page:
         at = ["--host", options.host, *(("--token", str(options.token)) if options.token is not None else ())]
         self._viewer = LiveViewer(options.run_folder, options.recordings, at) if options.rerun else None
         self._why = LiveWhy(options.run_folder, options.recordings, options.operator, at)
+        self._beside |= {"why": self._why, **({"rerun": self._viewer} if self._viewer is not None else {})}
         self._plots, self._texts, self._trails, self._beats = Every(1 / 5), Every(1 / 5), Every(1 / 5), Every(1 / 2)
         self._telling = Every(1 / 4)
         self._hw_seq = 0
 
     def _door(self, name: str) -> str | None:
-        """Where the page's links lead."""
-        return {"rerun": self._viewer.url if self._viewer is not None else None, "why": self._why.url}.get(name)
+        """Where the page's links lead; asked from the first moment on."""
+        beside = self._beside.get(name)
+        return beside.url if beside is not None else None
 
     def _latest(self) -> tuple[Telemetry | None, Freshness]:
         return self._feeds.telemetry.message, self._fresh()

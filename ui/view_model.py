@@ -251,7 +251,8 @@ class Gauge:
 
 
 def loop_gauges(telemetry: Telemetry | None) -> tuple[Gauge, ...]:
-    """How well the 30 Hz loop keeps time, and what the hw server had to do."""
+    """How well the 30 Hz loop keeps time, and what the hw server had to do; what matters most comes first, since a
+    narrow page shows as many as fit."""
     if telemetry is None:
         return ()
     loop, robot = telemetry.loop, telemetry.robot
@@ -261,16 +262,18 @@ def loop_gauges(telemetry: Telemetry | None) -> tuple[Gauge, ...]:
         Gauge(label="loop", value=f"{loop.hz:.1f} Hz" if loop.hz else "– Hz", tone=Tone.WARN if slow else Tone.IDLE),
         Gauge(label="late p50", value=f"{loop.late_p50_ms:.1f} ms"),
         Gauge(label="p99", value=f"{loop.late_p99_ms:.1f} ms", tone=Tone.WARN if loop.late_p99_ms > 5 else Tone.IDLE),
-        Gauge(label="max", value=f"{loop.late_max_ms:.1f} ms"),
-        Gauge(label="late ticks", value=_of(loop.late_ticks, loop.ticks)),
         Gauge(label="overruns", value=str(loop.overruns), tone=Tone.BAD if loop.overruns else Tone.IDLE),
         Gauge(label="starved", value=str(loop.starved), tone=Tone.WARN if loop.starved else Tone.IDLE),
-        Gauge(label="plan age", value=f"{loop.plan_age_ticks:.1f} ticks"),
     ]
     if robot is not None:
         gauges.append(Gauge(label="holds", value=str(robot.holds), tone=Tone.WARN if robot.holds else Tone.IDLE))
         gauges.append(Gauge(label="clips", value=str(robot.clips)))
-    return tuple(gauges)
+    return (
+        *gauges,
+        Gauge(label="late ticks", value=_of(loop.late_ticks, loop.ticks)),
+        Gauge(label="max", value=f"{loop.late_max_ms:.1f} ms"),
+        Gauge(label="plan age", value=f"{loop.plan_age_ticks:.1f} ticks"),
+    )
 
 
 def arm_word(status: RobotStatus | None, person: bool = False) -> tuple[str, Tone]:

@@ -215,6 +215,7 @@ def start_page(folder: Path, options: RunOptions, port: int, cameras: Sequence[s
     arguments = ["--run-folder", str(folder), "--host", options.page_host, "--port", str(port)]
     arguments += ["--token", str(options.page_token.absolute())] if options.page_token is not None else []
     arguments += ["--cameras", *cameras, "--recordings", str(options.recordings.absolute())]
+    arguments += ["--operator", options.operator]
     arguments += ["--no-scene3d"] * (not options.scene3d) + ["--no-rerun"] * (not options.rerun)
     return Child("page", "ui.server", arguments, folder)
 

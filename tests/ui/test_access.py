@@ -97,3 +97,17 @@ def test_a_foreign_origin_is_refused_though_it_has_the_cookie(page: PageProcess)
         with pytest.raises(InvalidStatus):
             RawClient(page.url, origin=origin, cookie=cookie)
     RawClient(page.url, origin=page.url, cookie=cookie).close()
+
+
+def test_a_link_leads_to_the_page_beside_it_by_the_name_that_was_asked_for() -> None:
+    access = Access(host="0.0.0.0", token=TOKEN)
+    url = f"http://{access.name}:81/?token={TOKEN}&url=rerun%2Bhttp%3A%2F%2F{access.name}%3A81%2Fproxy"
+    seen = access.seen_from(url, "192.168.1.5:8080")
+    assert seen == f"http://192.168.1.5:81/?token={TOKEN}&url=rerun%2Bhttp%3A%2F%2F192.168.1.5%3A81%2Fproxy"
+
+
+def test_a_link_to_what_does_not_run_says_so(start_page: Start, stage: Stage) -> None:
+    page = start_page()
+    for name in ("rerun", "why", "elsewhere", "../x"):
+        answer = ask(page, f"/go/{name}")
+        assert answer.status == 404 and answer.headers["Location"] is None
