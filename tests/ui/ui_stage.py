@@ -115,6 +115,8 @@ class Stage:
         self.mode = RobotMode.TRACKING
         self.intents: list[OperatorIntent] = []
         self.present: list[PagePresence] = []
+        self.words: list[Any] = []
+        """Nudges, marks and wishes."""
         self.stops: list[StopRequest] = []
         self.stop_answers = True
         self._bodies = bodies
@@ -168,8 +170,10 @@ class Stage:
             message = unpack(self._pull.recv())
             if isinstance(message, OperatorIntent):
                 self.intents.append(message)
-            else:
+            elif isinstance(message, PagePresence):
                 self.present.append(message)
+            else:
+                self.words.append(message)
         if self._geometry.poll(0):
             assert isinstance(unpack(self._geometry.recv()), GeometryRequest)
             vertices, faces = cube(0.08)
