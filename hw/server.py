@@ -14,6 +14,7 @@ it was started by a person. Ends by SIGTERM or SIGINT, and by itself when its pa
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import logging
 import os
@@ -36,7 +37,14 @@ from far_app.endpoints import HARDWARE, Endpoints
 from far_app.errors import ConfigError, FarError, RobotError
 from far_app.keys import server_keys
 from far_app.protocols import Hold
-from far_app.scheduling import PROMPT_NICENESS, SWITCH_INTERVAL, nice, prompt_context
+from far_app.scheduling import (
+    HARDWARE_PRIORITY,
+    PROMPT_NICENESS,
+    SWITCH_INTERVAL,
+    nice,
+    prompt_context,
+    real_time_from_here,
+)
 from far_app.station import Station
 from far_app.tasks import task as task_named
 from hw.camera_config import with_views
@@ -182,9 +190,12 @@ def serve(
     began = time.monotonic()
     try:
         rig = at_address(load_rig(rig_name, task_name), controller)
+        if rig.robot == "xarm":
+            real_time_from_here(HARDWARE_PRIORITY)  # no thread may wait for a core while it holds STOP's interpreter
         task = with_views(task_named(task_name, rig.arm), rig.cameras)
         server = Server(rig, task, endpoints)
         server.start()
+        freeze()
     except zmq.ZMQError as error:
         raise RobotError(f"cannot serve at {endpoints.commands}: {error}; choose another place") from error
     ending = Ending(parent)
@@ -195,6 +206,13 @@ def serve(
     why = ending.wait()
     log.info("ending: %s", why)
     server.close(why)
+
+
+def freeze() -> None:
+    """What is loaded by now is out of the collector's sight: a full collection, ten milliseconds with the interpreter
+    held, would make STOP wait; of what comes later there is little."""
+    gc.collect()
+    gc.freeze()
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -236,3 +238,15 @@ def test_a_latching_hold_stops_the_arm_at_its_controller_too(xarm: XArmBench) ->
     xarm.robot.request(Resume())
     assert xarm.fake.state()["mode"] == 1
     assert xarm.robot.observe().status.mode is RobotMode.HOLD
+
+
+def test_no_thread_beside_stop_may_wait_for_a_core_while_it_holds_the_interpreter(xarm: XArmBench) -> None:
+    """Those of the SDK included, also after it connected anew."""
+    if xarm.server.handshake["scheduling"] != "fifo":
+        pytest.skip("real time is not permitted here")
+    xarm.fake.tell(do="cut")
+    xarm.until(lambda o: o.status.fault)
+    xarm.robot.request(Resume())
+    threads = [int(path.name) for path in Path(f"/proc/{xarm.server.process.pid}/task").iterdir()]
+    assert len(threads) > 10
+    assert {os.sched_getscheduler(thread) & ~os.SCHED_RESET_ON_FORK for thread in threads} == {os.SCHED_FIFO}
