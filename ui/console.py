@@ -24,7 +24,7 @@ from ui.page_server import Presses
 from ui.plots import Plots
 from ui.scene3d import BRAND, FLAGGED, Scene3D
 from ui.stop import StopLine
-from ui.view_model import Freshness, adaptation, arm_word, banner, control, loop_gauges, summary
+from ui.view_model import Freshness, adaptation, arm_word, banner, camera_note, control, loop_gauges, summary
 
 PLACES = ("front", "wrist")
 """On the page, left to right, as style.css names them, whatever the views are called; more of them: the rerun page."""
@@ -86,6 +86,8 @@ class Console:
         self._beats = 0
         self._images: dict[str, viser.GuiImageHandle] = {}
         self._pictures: dict[str, bytes] = {}
+        self._captions: dict[str, tuple[viser.GuiHtmlHandle, str]] = {}
+        """Above each camera's picture, and its place's mark."""
         self._controls: dict[Intent, tuple[_Button, viser.GuiButtonHandle, Any]] = {}
         server.gui.configure_theme(dark_mode=True, brand_color=BRAND, show_logo=False, show_share_button=False)
         server.gui.set_panel_label("FAR")
@@ -131,7 +133,7 @@ class Console:
 
     def _add_cameras(self) -> None:
         for camera, place in zip(self._cameras, PLACES, strict=False):
-            self._gui.add_html(html.caption(camera, "", f"mark-{place}"))
+            self._captions[camera] = (self._gui.add_html(html.caption(camera, "", f"mark-{place}")), f"mark-{place}")
             self._images[camera] = self._gui.add_image(_BLANK, format="jpeg")
 
     def _press_stop(self, source: str) -> None:
@@ -188,6 +190,9 @@ class Console:
             handle.disabled, handle.label = not now.enabled, f"{button.label}\n{line}"
             if command is not None:
                 command.disabled = not now.enabled
+        for camera, (handle, mark) in self._captions.items():
+            note, tone = camera_note(view.cameras.get(camera) if view is not None else None)
+            handle.content = html.caption(camera, note, mark, tone)
         self._adapt.content = html.adaptation(adaptation(telemetry))
         refusal = self.refusal if time.monotonic() - self._refused_at < 6 else ""
         gauges, session = loop_gauges(telemetry), telemetry.session if telemetry else ""

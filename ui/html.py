@@ -116,9 +116,9 @@ def foot(gauges: tuple[Gauge, ...], refusal: str, viewer: str | None, session: s
     return f'<div class="far-foot" id="op-loop">{items}</div>'
 
 
-def caption(title: str, note: str = "", mark: str = "") -> str:
+def caption(title: str, note: str = "", mark: str = "", tone: Tone = Tone.IDLE) -> str:
     """A title above a picture or a plot; `mark` names it for style.css."""
-    return f'<div class="far-caption {mark}"><b>{escape(title)}</b><em>{escape(note)}</em></div>'
+    return f'<div class="far-caption {mark} tone-{tone}"><b>{escape(title)}</b><em>{escape(note)}</em></div>'
 
 
 def value_caption(telemetry: Telemetry | None) -> str:
