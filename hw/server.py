@@ -52,6 +52,7 @@ from hw.camera_thread import CameraThread
 from hw.command_thread import CommandThread
 from hw.controller import ArmController
 from hw.hardware_view import HardwareView
+from hw.lease import claim
 from hw.picture_timing import PictureTiming
 from hw.plant import Plant, PlantView
 from hw.publisher_thread import PublisherThread
@@ -75,6 +76,7 @@ def make_plant(rig: RigConfig, task: TaskConfig) -> tuple[Plant, Callable[[], Pl
         from hw.xarm7.blind import BlindView
         from hw.xarm7.plant import XArmPlant
 
+        claim(rig.xarm.address, rig.xarm.port)
         return XArmPlant(rig, task), BlindView
     from hw.twin import TwinPlant
     from hw.twin_view import TwinView
