@@ -43,8 +43,8 @@ class FakeController:
     async def run(self) -> None:
         """Serve the arm's ports and the control port until told to end. Raises RobotError where a port is taken."""
         try:
-            control = await asyncio.start_server(self._control, self.address, self.control_port)
             await self._listen()
+            control = await asyncio.start_server(self._control, self.address, self.control_port)
         except OSError as error:
             raise RobotError(
                 f"the fake controller cannot serve on {self.address} ({error.strerror}); end what listens there, or "

@@ -224,7 +224,7 @@ def test_a_tool_that_differs_is_set_before_servo_mode(fake: FakeXArm) -> None:
 
 def test_a_rig_faster_than_its_servo_step_is_refused() -> None:
     rig = load_rig("xarm7")
-    with pytest.raises(ConfigError, match=r"servo step of at most 2\.5 mm at 100 Hz allows 0\.25 m/s"):
+    with pytest.raises(ConfigError, match=r"servo ticks of at most 0\.0025 m at 100 Hz allow 0\.25 m/s"):
         replace(rig, safety=replace(rig.safety, speed=0.4))
 
 
