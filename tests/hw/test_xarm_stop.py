@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
+import threading
 import time
 from collections.abc import Iterator
 
@@ -66,3 +68,16 @@ def test_without_its_connection_the_others_carry_the_frame(plant: XArmPlant, fak
     time.sleep(0.1)
     assert stops(fake) and fake.state()["state"] == 4
     assert not plant.links.stop.confirmed.is_set(), "nobody was there to hear it confirmed"
+
+
+def test_the_frame_waits_for_no_lock_and_no_answer(plant: XArmPlant, fake: FakeXArm) -> None:
+    """Each connection is as a call leaves it that waits for an answer; the plant's own lock is free then."""
+    links = plant.links
+    with contextlib.ExitStack() as stuck:
+        for api in (links.motion, links.feedback, links.stop.api):
+            stuck.enter_context(api._arm.arm_cmd.lock)
+        halting = threading.Thread(target=plant.halt, daemon=True)
+        halting.start()
+        halting.join(5.0)
+        assert not halting.is_alive() and stops(fake)
+    assert links.stop.confirmed.wait(2.0)
