@@ -197,7 +197,7 @@ def _start_again(fake: FakeXArm) -> dict[str, Any]:
     return {"resumed": ready, "first_mm": float(np.linalg.norm(first - stood)) if len(targets) else None}
 
 
-def _environment(clock: Path) -> Mapping[str, str]:
+def stepped_clock(clock: Path) -> Mapping[str, str]:
     """Of a run whose wall clock can be stepped."""
     return os.environ | {"PYTHONPATH": str(Path(wall_clock.__path__[0])), "FAR_BENCH_CLOCK": str(clock)}
 
@@ -210,7 +210,7 @@ def _started(blow: Blow, address: str, policy: str, folder: Path) -> Struck:
     command += ["--policy", policy, "--recordings", str(folder / "recordings"), "--max-attempts", "100"]
     command += ["--port", "0"] if blow.page else ["--headless"]
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=_environment(clock)
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=stepped_clock(clock)
     )
     run = Struck(process=process, fake=fake, clock=clock)
     if blow.page:
@@ -242,4 +242,6 @@ def _wait_for_motion(run: Struck, recordings: Path) -> None:
             run.fake.received()
             return
         time.sleep(0.1)
-    raise FarError(f"the run did not come to move the arm within {START:g} s (exit status {run.process.poll()})")
+    run.process.kill()
+    said = run.process.communicate()[1].strip().splitlines()[-1:]
+    raise FarError(f"the run did not come to move the arm within {START:g} s; it said: {''.join(said)}")
