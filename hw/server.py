@@ -34,9 +34,8 @@ import cv2
 import zmq
 
 from far_app.config import TaskConfig
-from far_app.endpoints import HARDWARE, Endpoints
-from far_app.errors import ConfigError, FarError, RobotError
-from far_app.keys import server_keys
+from far_app.endpoints import Endpoints
+from far_app.errors import FarError, RobotError
 from far_app.protocols import Hold
 from far_app.scheduling import (
     HARDWARE_PRIORITY,
@@ -56,6 +55,7 @@ from hw.hardware_view import HardwareView
 from hw.input_device.reader import InputReader
 from hw.lease import claim
 from hw.picture_timing import PictureTiming
+from hw.places import in_folder, to_machines
 from hw.plant import Plant, PlantView
 from hw.publisher_thread import PublisherThread
 from hw.rig import RigConfig, at_address, load_rig
@@ -66,8 +66,6 @@ log = logging.getLogger(__name__)
 
 LOOK = 0.1
 """Seconds between looks at the parent and the threads."""
-SOCKET_NAME = 107
-"""Bytes the operating system allows in a socket's name."""
 BRAKING = 0.3
 """Seconds given to the arm to stand still before the process goes."""
 
@@ -165,33 +163,6 @@ class Ending:
     def _on_signal(self, number: int, frame: object) -> None:
         self._reasons.append(f"the hw server was told to end ({signal.Signals(number).name})")
         self._told.set()
-
-
-def in_folder(folder: Path) -> Endpoints:
-    """Endpoints for an app on this machine; the folder is made. Raises ConfigError."""
-    longest = len(str(folder / "observations").encode())
-    if longest > SOCKET_NAME:
-        raise ConfigError(
-            f"sockets below {folder} need names of {longest} bytes, at most {SOCKET_NAME} fit; choose a shorter folder"
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    return Endpoints.in_folder(folder)
-
-
-def to_machines(address: str, keys: Path | None) -> Endpoints:
-    """Endpoints for an app on another machine. Raises ConfigError, also where a port is taken."""
-    endpoints = Endpoints.at(address, server_keys(keys) if keys is not None else None)
-    with zmq.Context() as context, context.socket(zmq.PAIR) as socket:
-        for name in HARDWARE:
-            endpoint = getattr(endpoints, name)
-            try:
-                socket.bind(endpoint)
-            except zmq.ZMQError as error:
-                raise ConfigError(
-                    f"cannot serve {name} at {endpoint}: {error}; {len(HARDWARE)} ports from {address} on must be "
-                    "free, and the address one of this machine's: is another hw server running?"
-                ) from error
-    return endpoints
 
 
 def serve(
