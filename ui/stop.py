@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import zmq
 
 from far_app.endpoints import Endpoints
+from far_app.scheduling import STOP_PRIORITY, prompt_context, real_time
 from far_app.telemetry import StopAck, StopRequest
 from far_app.wire import WireError, pack, unpack
 
@@ -55,8 +56,8 @@ class StopLine:
         self._thread.join(timeout=1.0)
 
     def _serve(self) -> None:
-        hasten(threading.get_native_id())
-        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
+        real_time(STOP_PRIORITY)  # niceness would not do: it says nothing to the programs of another session
+        context = prompt_context()
         self._endpoints.secure(context)
         socket = self._connected(context)
         while True:
