@@ -150,6 +150,7 @@ def test_the_gripper_follows_without_stalling_the_servo_loop(cell: Cell, fake: F
     targets, state = fake.servo_targets(), fake.state()
     assert fake_at["gripper"] > 800 and state["gripper"] < 100
     assert state["gripper_writes"] - writes == 1, "told once; a change within the hysteresis is not told"
+    assert state["gripper_speed"] == cell.rig.xarm.gripper.speed
     assert cell.servo.newest.measured.gripper < 0.1, "its opening is read back"
     assert np.percentile(np.diff([t["at"] for t in targets]), 95) < 0.02
     cell.go_home()
@@ -174,10 +175,13 @@ def test_starting_leaves_what_the_hand_holds_in_the_hand(fake: FakeXArm) -> None
 @pytest.mark.slow
 def test_a_g2_gripper_is_told_millimetres(fake: FakeXArm) -> None:
     rig = rig_at(fake, FAKE_PORT)
-    g2 = replace(rig.xarm.gripper, kind="g2", open=84.0, closed=0.0, speed=150.0)
+    g2 = replace(rig.xarm.gripper, kind="g2", open=84.0, closed=0.0, speed=150.0, force=40.0)
     cell = Cell(fake, replace(rig, xarm=replace(rig.xarm, gripper=g2)))
     cell.drive(np.array((0, 0, 0, 0, 0, 0, 1.0)), 30)
     assert cell.servo.newest.measured.gripper < 0.1
+    state = fake.state()
+    assert state["gripper_force"] == 40
+    assert state["gripper_speed"] == int((150 * 60 / 9.88235 + 140) / 0.4), "mm/s in the hand's own unit (SDK)"
     cell.drive(np.array((0, 0, 0, 0, 0, 0, -1.0)), 30)
     assert cell.servo.newest.measured.gripper > 0.9
     cell.close()
