@@ -221,5 +221,6 @@ class FakeController:
         return {
             "mode": arm.mode, "state": int(arm.state), "error": arm.error, "enabled": arm.enabled,
             "position": arm.position.tolist(), "quaternion": arm.quaternion.tolist(), "gripper": hand.position,
-            "gripper_writes": hand.writes, "gripper_speed": hand.speed, "gripper_force": hand.force, "connections": len(self._writers), "now": time.monotonic(),
+            "gripper_writes": hand.writes, "gripper_speed": hand.speed, "gripper_force": hand.force,
+            "connections": len(self._writers), "now": time.monotonic(),
         }  # fmt: skip
