@@ -202,6 +202,25 @@ class GeometryRequest:
 
 @register
 @dataclass(frozen=True, kw_only=True)
+class CameraHealth:
+    """Of one camera, since the hw server's start."""
+
+    frames: int = 0
+    """New pictures."""
+    dropped: int = 0
+    """Missing between two that came."""
+    stale: int = 0
+    """Too old when they came."""
+    frozen: int = 0
+    """The picture before once more."""
+    reopened: int = 0
+    """Times it was lost and came back."""
+    age: float = 0.0
+    """Of the newest new picture, seconds."""
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
 class View:
     """From the hw server to the page, at 15 Hz: operator-size pictures and where every body is."""
 
@@ -213,3 +232,5 @@ class View:
     body_poses: Float[np.ndarray, "B 7"]
     """Position and xyzw quaternion by body, metres, base frame."""
     status: RobotStatus
+    cameras: Mapping[str, CameraHealth] = field(default_factory=dict)
+    """By view name; empty for pictures that are drawn."""

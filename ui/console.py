@@ -32,7 +32,7 @@ from ui.scene_overlay import SceneOverlay
 from ui.stop import StopLine
 from ui.take_over import TakeOver
 from ui.trials_panel import TrialsPanel
-from ui.view_model import Freshness, adaptation, arm_word, banner, control, loop_gauges, summary
+from ui.view_model import Freshness, adaptation, arm_word, banner, camera_note, control, loop_gauges, summary
 from ui.viewers import Live, Viewers
 
 PLACES = ("front", "wrist")
@@ -100,6 +100,8 @@ class Console:
         self._beats = 0
         self._images: dict[str, viser.GuiImageHandle] = {}
         self._pictures: dict[str, bytes] = {}
+        self._captions: dict[str, tuple[viser.GuiHtmlHandle, str]] = {}
+        """Above each camera's picture, and its place's mark."""
         self._controls: dict[Intent, tuple[_Button, viser.GuiButtonHandle, viser.CommandHandle | None]] = {}
         server.gui.configure_theme(dark_mode=True, brand_color=BRAND, show_logo=False, show_share_button=False)
         server.gui.set_panel_label("FAR")
@@ -157,7 +159,7 @@ class Console:
 
     def _add_cameras(self) -> None:
         for camera, place in zip(self._cameras, PLACES, strict=False):
-            self._gui.add_html(html.caption(camera, "", f"mark-{place}"))
+            self._captions[camera] = (self._gui.add_html(html.caption(camera, "", f"mark-{place}")), f"mark-{place}")
             self._images[camera] = self._gui.add_image(_BLANK, format="jpeg")
 
     def _press_stop(self, source: str) -> None:
@@ -213,6 +215,9 @@ class Console:
         self._panels.show(telemetry)
         self._plan.show(telemetry)
         self._overlay.show(telemetry, view)
+        for camera, (handle, mark) in self._captions.items():
+            note, tone = camera_note(view.cameras.get(camera) if view is not None else None)
+            handle.content = html.caption(camera, note, mark, tone)
         self._adapt.content = html.adaptation(adaptation(telemetry))
         refusal = self.refusal if time.monotonic() - self._refused_at < 6 else ""
         gauges, session = loop_gauges(telemetry), telemetry.session if telemetry else ""

@@ -29,7 +29,7 @@ from far_app.cli.processes import Child, Family, run_folder
 from far_app.config import TaskConfig
 from far_app.detectors import PersonJudge, TwinCheck
 from far_app.endpoints import Endpoints, note_elsewhere
-from far_app.errors import FarError, RobotError
+from far_app.errors import ArmTaken, FarError, RobotError
 from far_app.link import RemoteRobot
 from far_app.protocols import Method, PlanRequest, Policy, SuccessDetector
 from far_app.recording.schema import SessionInfo
@@ -251,6 +251,8 @@ def connected(folder: Path, hardware: Child | None) -> Iterator[RemoteRobot]:
             hardware.check()
         try:
             robot = RemoteRobot(Endpoints.in_folder(folder), connect_timeout=1.0 if hardware is not None else 5.0)
+        except ArmTaken:
+            raise
         except RobotError as error:
             if time.monotonic() > deadline:
                 raise RobotError(
