@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from far_app.session_states import Intent, State
-from far_app.types import AdaptationStep, Pose, RobotStatus
+from far_app.types import TICK_STAGES, AdaptationStep, Pose, RobotStatus
 from far_app.wire import register
 
 
@@ -32,6 +32,8 @@ class LoopHealth:
     """Ticks with no plan left."""
     plan_age_ticks: float = 0.0
     """Age of the newest chunk, ticks (recent median)."""
+    stages: Float[np.ndarray, "T S"] = field(default_factory=lambda: np.zeros((0, len(TICK_STAGES)), np.float32))
+    """Milliseconds that each of the last ten seconds' ticks spent on each of TICK_STAGES, newest last."""
 
 
 @register

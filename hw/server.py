@@ -85,7 +85,7 @@ class Server:
         self.plant, make_bodies = make_plant(rig, task)
         cameras = rig.cameras
         make_view = (lambda: HardwareView(make_bodies(), cameras)) if cameras else make_bodies
-        controller = ArmController(rig, task, self.plant.servo_hz, self.plant.measure())
+        controller = ArmController(rig, task, self.plant.servo_hz, self.plant.measure(), time.perf_counter)
         self.servo = ServoThread(self.plant, controller, camera_rate=task.rate)
         self.publisher = PublisherThread(self.servo, self.context, endpoints.observations, task.rate)
         self.cameras = CameraThread(
