@@ -72,10 +72,14 @@ def thin_meshes(spec: mujoco.MjSpec, budget: int = FACE_BUDGET) -> None:
         mesh.userface = np.asarray(faces, np.int32).ravel()
 
 
-def visual_model(xml: str, cameras: Mapping[str, CameraPlacement]) -> mujoco.MjModel:
-    """The scene for drawing only: thinned meshes, our cameras, no shadows, reflections or multisampling."""
+def visual_model(
+    xml: str, cameras: Mapping[str, CameraPlacement], budget: int | None = FACE_BUDGET
+) -> mujoco.MjModel:  # fmt: skip
+    """The scene for drawing only: thinned meshes, our cameras, no shadows, reflections or multisampling. Without a
+    budget the meshes stay whole: what the thinned ones are compared with."""
     spec = mujoco.MjSpec.from_string(xml)
-    thin_meshes(spec)
+    if budget is not None:
+        thin_meshes(spec, budget)
     for name, camera in cameras.items():
         body = spec.body(camera.body)
         body.add_camera(name=name, pos=camera.position, quat=look_at(camera), fovy=camera.fovy)
@@ -89,8 +93,11 @@ def visual_model(xml: str, cameras: Mapping[str, CameraPlacement]) -> mujoco.MjM
 class TwinView:
     """A PlantView (hw/plant.py) of TwinPlant's snapshots. Make and use it in one thread."""
 
-    def __init__(self, xml: str, base: Pose, cameras: Mapping[str, CameraPlacement]) -> None:
-        self._model = visual_model(xml, cameras)
+    def __init__(
+        self, xml: str, base: Pose, cameras: Mapping[str, CameraPlacement], budget: int | None = FACE_BUDGET
+    ) -> None:
+        """`budget`: faces kept of each mesh; None keeps all."""
+        self._model = visual_model(xml, cameras, budget)
         self._data = mujoco.MjData(self._model)
         self._base = base
         self._renderers: dict[int, mujoco.Renderer] = {}
@@ -99,6 +106,11 @@ class TwinView:
         self._options.geomgroup[:] = 0
         self._options.geomgroup[1] = 1
         self._options.sitegroup[:] = 0
+
+    @property
+    def faces(self) -> int:
+        """Triangles of all meshes."""
+        return int(self._model.nmeshface)
 
     def _renderer(self, size: int) -> mujoco.Renderer:
         if size not in self._renderers:

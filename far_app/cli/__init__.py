@@ -32,6 +32,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "policy list": ("far_app.cli.policy_list", "the adapted policy versions a session kept, and their lineage"),
     "policy promote": ("far_app.cli.policy_promote", "an adapted version as a checkpoint of its own"),
     "bench loop": ("far_app.bench.loop", "lateness of the 30 Hz loop, idle and adapting"),
+    "bench render": ("far_app.bench.render", "milliseconds to draw the twin's cameras"),
     "bench infer": ("far_app.bench.infer", "milliseconds per chunk, by preset"),
     "bench adapt": ("far_app.bench.adapt", "seconds from a failed attempt to a new policy version, by stage"),
     "bench critic": ("far_app.bench.critic", "can Q rank what the policy would do: before trusting FAR with a model"),

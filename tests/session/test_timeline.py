@@ -9,7 +9,6 @@ from far_app.recording.reader import read_session
 from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
 from far_app.session import timeline as stages
-from far_app.session.recorder import Recorder
 from far_app.session.timeline import SETTLED, Timeline
 from far_app.session_states import Intent
 from far_app.types import TICK_STAGES, Ack
@@ -132,9 +131,8 @@ def test_percentiles_are_of_the_attempts_ticks_alone(clock):
 
 
 def test_a_session_records_the_times_of_every_tick_of_its_attempts(tmp_path):
-    desk = Desk(policy=Forward(speed=0.1, seconds=0.002), attempts=2, horizon=15)
     writer = SessionWriter(tmp_path, SessionInfo(task="lift", method="nr"), space_to_start=0, space_to_go_on=0)
-    desk.session.recorder = desk.session.supervision.recorder = Recorder(writer)
+    desk = Desk(policy=Forward(speed=0.1, seconds=0.002), attempts=2, horizon=15, writer=writer)
     desk.session.run()
     for attempt in read_session(writer.folder).attempts():
         ticks = [t.tick for t in attempt.tick_times]
