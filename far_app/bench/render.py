@@ -1,7 +1,8 @@
 """`far bench render`: milliseconds to draw both cameras of the twin, its thinned meshes beside the whole ones.
 
 Both views are drawn in turns in one process, of the same moments, with the same flags; what differs between their
-pictures is told in grey levels. `python -m` nothing: the pictures of both forms can be kept with --pictures.
+pictures is told in grey levels.
+--pictures keeps some of both.
 """
 
 from __future__ import annotations

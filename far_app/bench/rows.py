@@ -81,15 +81,11 @@ def timed_side_by_side(
 
 
 def row_of(
-    what: str,
-    fast: Sequence[float],
-    plain: Sequence[float] | None = None,
-    target: float | None = None,
-    unit: str = "ms",
-) -> Row:
-    """From the durations of each repeat."""
+    what: str, fast: Sequence[float], plain: Sequence[float] | None = None, target: float | None = None
+) -> Row:  # fmt: skip
+    """From the milliseconds of each repeat."""
     return Row(
-        what=what, unit=unit, fast=_rounded(np.median(fast)), p99=_rounded(np.percentile(fast, 99)),
+        what=what, unit="ms", fast=_rounded(np.median(fast)), p99=_rounded(np.percentile(fast, 99)),
         plain=None if plain is None else _rounded(np.median(plain)), repeats=len(fast), target=target,
     )  # fmt: skip
 
