@@ -34,6 +34,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "bench loop": ("far_app.bench.loop", "lateness of the 30 Hz loop, idle and adapting"),
     "bench render": ("far_app.bench.render", "milliseconds to draw the twin's cameras"),
     "bench infer": ("far_app.bench.infer", "milliseconds per chunk, by preset"),
+    "bench train": ("far_app.bench.train", "gradient steps a second, plain and fast"),
     "bench adapt": ("far_app.bench.adapt", "seconds from a failed attempt to a new policy version, by stage"),
     "bench critic": ("far_app.bench.critic", "can Q rank what the policy would do: before trusting FAR with a model"),
     "bench success": ("far_app.bench.success", "a success detector against the twin's own check, on held-out attempts"),

@@ -89,6 +89,17 @@ def object_offsets(episodes: Sequence[Episode]) -> np.ndarray | None:
     return (np.concatenate(parts).reshape(sum(map(len, parts)), -1) * 10.0).astype(np.float32)
 
 
+def history_features(policy: DiffusionPolicy, images: dict[str, Tensor], states: Tensor) -> Tensor:
+    """Features of every history in a batch of segments, (count · length, F), each history encoded for itself."""
+    n_obs = policy.config.n_obs
+    length = states.shape[1] - n_obs + 1
+
+    def histories(x: Tensor) -> Tensor:
+        return torch.stack([x[:, t : t + length] for t in range(n_obs)], dim=2).flatten(0, 1)
+
+    return policy.features({c: histories(x) for c, x in images.items()}, histories(states))
+
+
 def segment_features(policy: DiffusionPolicy, images: dict[str, Tensor], states: Tensor) -> Tensor:
     """Features of every history in a batch of segments, (count · length, F); each frame is encoded once where the
     encoder shares its weights over the frames."""
