@@ -28,7 +28,7 @@ from far_app.learning.dataset import Episode
 from far_app.learning.policy import DiffusionPolicy, PolicyConfig, save_policy
 from far_app.learning.policy_step import FastStep, PlainStep
 from far_app.learning.resume import load_state, optimizer_tensors, restore_optimizer, save_state
-from far_app.learning.segments import DemonstrationArrays
+from far_app.learning.segments import DemonstrationArrays, DeviceDemonstrations
 
 log = logging.getLogger(__name__)
 
@@ -99,7 +99,12 @@ def train_policy(
     torch.manual_seed(training.seed)
     rng = np.random.default_rng(training.seed)
     generator = torch.Generator().manual_seed(training.seed)
-    arrays = DemonstrationArrays(episodes, config, training.shift)
+    on_cpu = torch.device(device).type == "cpu"
+    arrays = (
+        DemonstrationArrays(episodes, config, training.shift)
+        if on_cpu or plain
+        else DeviceDemonstrations(episodes, config, training.shift, device)
+    )
     step = begun(PlainStep if plain else FastStep, config, training, arrays, device, imagenet, start)
     policy, ema, locator, optimizer = step.policy, step.ema, step.locator, step.optimizer
     state_path = folder / "state.safetensors"
