@@ -1,10 +1,10 @@
 """A dataset's pictures decoded once, into plain arrays beside it that later readers map into memory.
 
-    datasets/lift.hdf5  →  datasets/lift.hdf5.decoded/KEY/front.npy, wrist.npy     (N, S, S, 3) uint8, all ticks
+    datasets/lift.hdf5  →  datasets/lift.hdf5.decoded/STATE/CHOICE/front.npy, wrist.npy    (N, S, S, 3) uint8, all ticks
 
-KEY is the hash of everything the pictures depend on (the file's size and time of change, which demonstrations, size,
-framing), so that a changed dataset never finds old pictures. Several trainings on one machine share the pages. Where
-nothing can be written the pictures are decoded into memory, as ever.
+STATE is the file's size and time of change, so that a changed dataset never finds old pictures (they are deleted when
+new ones are made); CHOICE is the hash of which demonstrations, cameras, size and framing. Several trainings on one
+machine share the pages. Where nothing can be written the pictures are decoded into memory, as ever.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def decoded_episodes(
     """As read_episodes, with pictures that are read-only maps of the decoded files; made when they are not there."""
     if not cameras or not path.exists():
         return read_episodes(path, cameras, limit, size, framings)
-    folder = path.with_name(path.name + ".decoded") / _key(path, cameras, limit, size, framings)
+    folder = _state(path) / _choice(cameras, limit, size, framings)
     if not folder.exists():
         try:
             _decode(path, folder, cameras, limit, size, framings)
@@ -76,16 +76,20 @@ def _decode(
         for file in files.values():
             file.flush()  # type: ignore[attr-defined]
         partial.rename(folder)
+        for old in folder.parent.parent.iterdir():
+            if old != folder.parent:
+                shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def _key(
-    path: Path, cameras: tuple[str, ...], limit: int | None, size: int | None, framings: Mapping[str, Framing] | None
-) -> str:
+def _state(path: Path) -> Path:
     state = path.stat()
-    depends = [
-        state.st_size, state.st_mtime_ns, sorted(cameras), limit, size,
-        {c: dataclasses.asdict(f) for c, f in sorted((framings or {}).items())},
-    ]  # fmt: skip
-    return hashlib.sha256(json.dumps(depends).encode()).hexdigest()[:24]
+    return path.with_name(path.name + ".decoded") / f"{state.st_size:x}-{state.st_mtime_ns:x}"
+
+
+def _choice(
+    cameras: tuple[str, ...], limit: int | None, size: int | None, framings: Mapping[str, Framing] | None
+) -> str:
+    cut = {camera: dataclasses.asdict(framing) for camera, framing in sorted((framings or {}).items())}
+    return hashlib.sha256(json.dumps([sorted(cameras), limit, size, cut]).encode()).hexdigest()[:24]

@@ -58,6 +58,7 @@ def test_a_changed_dataset_is_decoded_anew(dataset):
     write_episode(dataset, episodes(1)[0], {"env_name": "Lift"})
     os.utime(dataset, ns=(1, 1))
     same(decoded_episodes(dataset, CAMERAS), read_episodes(dataset, CAMERAS))
+    assert len(list(dataset.with_name("d.hdf5.decoded").iterdir())) == 1, "the old pictures are gone"
 
 
 def test_nothing_half_decoded_is_left_or_used(dataset, monkeypatch):
@@ -70,7 +71,7 @@ def test_nothing_half_decoded_is_left_or_used(dataset, monkeypatch):
 
     monkeypatch.setattr(decoded, "read_episodes", until_full)
     same(decoded_episodes(dataset, CAMERAS), read_episodes(dataset, CAMERAS))
-    assert not list(dataset.with_name("d.hdf5.decoded").iterdir())
+    assert not list(dataset.with_name("d.hdf5.decoded").glob("*/*"))
     monkeypatch.setattr(decoded, "read_episodes", read)
     same(decoded_episodes(dataset, CAMERAS), read_episodes(dataset, CAMERAS))
 
