@@ -40,7 +40,8 @@ def register(cls: _T) -> _T:
         _ENUMS[cls.__name__] = cls
     else:
         _CLASSES[cls.__name__] = cls
-        _FIELDS[cls] = tuple(f.name for f in dataclasses.fields(cls))
+        record: Any = cls
+        _FIELDS[cls] = tuple(f.name for f in dataclasses.fields(record))
     return cls
 
 

@@ -126,4 +126,5 @@ class FastStep(PlainStep):
         return segment_features(self.policy, images, states)
 
     def _follow(self, share: float) -> None:
-        torch._foreach_lerp_(list(self.ema.parameters()), list(self.policy.parameters()), share)
+        slow, fast = list(self.ema.parameters()), list(self.policy.parameters())
+        torch._foreach_lerp_(slow, fast, share)  # pyright: ignore[reportPrivateImportUsage] - it has no public name
