@@ -126,5 +126,6 @@ class FastStep(PlainStep):
         return segment_features(self.policy, images, states)
 
     def _follow(self, share: float) -> None:
-        slow, fast = list(self.ema.parameters()), list(self.policy.parameters())
+        slow: list[Tensor] = [*self.ema.parameters()]
+        fast: list[Tensor] = [*self.policy.parameters()]
         torch._foreach_lerp_(slow, fast, share)  # pyright: ignore[reportPrivateImportUsage] - it has no public name
