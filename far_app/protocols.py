@@ -40,10 +40,20 @@ class Resume:
 
 @dataclass(frozen=True, kw_only=True)
 class Heartbeat:
-    """The app lives; stands for targets while homing."""
+    """The app lives; stands for targets while homing, and while a person leads the arm."""
 
 
-Request = Reset | Home | Hold | Resume | Heartbeat
+@dataclass(frozen=True, kw_only=True)
+class Guide:
+    """A person leads the arm by hand (on), or not any more. Targets are refused meanwhile, and heartbeats keep it so;
+    without them the arm is held. Refused by an arm that cannot be led."""
+
+    on: bool
+    gripper: float = -1.0
+    """−1 opens, +1 closes; may be asked for anew while it is led."""
+
+
+Request = Reset | Home | Hold | Resume | Heartbeat | Guide
 
 
 @runtime_checkable
@@ -205,6 +215,44 @@ class KeepsWeights(Protocol):
     def adapted(self) -> AdaptedWeights | None:
         """Those of the version that acts now; None while that is the base policy."""
         ...
+
+
+@runtime_checkable
+class ChangesWeights(Protocol):
+    """A method that can be told which version to act with."""
+
+    @property
+    def policy(self) -> Policy: ...
+
+    def use(self, weights: AdaptedWeights | None, version: str, *, base: bool) -> None:
+        """From now on act with these weights, None for the policy it was made with; `base`: trials begin with them.
+        Between attempts only; may take as long as making a policy does. Raises FarError where they do not fit."""
+        ...
+
+
+class Person(Protocol):
+    """Somebody who may take the arm from the policy during an attempt."""
+
+    @property
+    def steers(self) -> bool:
+        """The person has the arm."""
+        ...
+
+    def action(self, observation: Observation) -> Float[np.ndarray, "A"] | None:
+        """The coming tick's action, like a policy's; None while the policy acts. Asked once a tick; never waits."""
+        ...
+
+
+class Nobody:
+    """far_app.protocols.Person where none is there."""
+
+    steers = False
+
+    def action(self, observation: Observation) -> None:
+        return None
+
+
+NOBODY = Nobody()
 
 
 @runtime_checkable

@@ -24,6 +24,8 @@ class State(StrEnum):
     """Going to the start pose before a first attempt."""
     RUNNING = "running"
     """An attempt is under way."""
+    TAKEN_OVER = "taken_over"
+    """An attempt is under way and a person moves the arm."""
     PAUSED = "paused"
     """An attempt is held by the operator."""
     ADAPTING = "adapting"
@@ -31,6 +33,8 @@ class State(StrEnum):
     TRIAL_DONE = "trial_done"
     AWAITING_SCENE = "awaiting_scene"
     """Hardware only: held until the operator has rebuilt the scene and says the workspace is clear."""
+    REVIEWING = "reviewing"
+    """A demonstration has ended: the operator keeps it, discards it or records it again."""
     STOPPED = "stopped"
     """The operator pressed STOP; only Resume leaves."""
     FAULT = "fault"
@@ -49,7 +53,16 @@ class Intent(StrEnum):
     MARK_SUCCESS = "mark_success"
     MARK_FAILURE = "mark_failure"
     SKIP_TRIAL = "skip_trial"
+    TAKE_OVER = "take_over"
+    """A person moves the arm from here on."""
+    HAND_BACK = "hand_back"
+    """The policy acts again."""
     SCENE_READY = "scene_ready"
+    KEEP = "keep"
+    """The demonstration goes to the dataset."""
+    DISCARD = "discard"
+    RECORD_AGAIN = "record_again"
+    """The demonstration is discarded and its scene recorded anew."""
     QUIT = "quit"
 
 
@@ -68,6 +81,7 @@ class Happening(StrEnum):
     FAULT = "fault"
     NO_MORE_TRIALS = "no_more_trials"
     NEED_SCENE = "need_scene"
+    NEED_REVIEW = "need_review"
     GO_ON_ATTEMPT = "go_on_attempt"
     """A held attempt goes on."""
     GO_ON_HOMING = "go_on_homing"
@@ -99,6 +113,11 @@ def _table() -> dict[tuple[State, Event], State]:
         (s.TRIAL_DONE, h.NEED_SCENE): s.AWAITING_SCENE,
         (s.TRIAL_DONE, h.NO_MORE_TRIALS): s.FINISHED,
         (s.AWAITING_SCENE, i.SCENE_READY): s.READY,
+        (s.TRIAL_DONE, h.NEED_REVIEW): s.REVIEWING,
+        (s.READY, h.NEED_REVIEW): s.REVIEWING,  # after a stop
+        (s.REVIEWING, i.KEEP): s.TRIAL_DONE,
+        (s.REVIEWING, i.DISCARD): s.TRIAL_DONE,
+        (s.REVIEWING, i.RECORD_AGAIN): s.TRIAL_DONE,
         # the operator's word on the attempt; what follows is a happening of the same tick
         (s.RUNNING, i.MARK_SUCCESS): s.RUNNING,
         (s.RUNNING, i.MARK_FAILURE): s.RUNNING,
@@ -109,6 +128,17 @@ def _table() -> dict[tuple[State, Event], State]:
         (s.PAUSED, i.SKIP_TRIAL): s.RUNNING,
         (s.HOMING, i.SKIP_TRIAL): s.TRIAL_DONE,
         (s.ADAPTING, i.SKIP_TRIAL): s.TRIAL_DONE,
+        # a person has the arm: the attempt goes on, and ends as it would under the policy
+        (s.RUNNING, i.TAKE_OVER): s.TAKEN_OVER,
+        (s.PAUSED, i.TAKE_OVER): s.TAKEN_OVER,  # a paused attempt's; refused on the way home (session/operator.py)
+        (s.TAKEN_OVER, i.HAND_BACK): s.RUNNING,
+        (s.TAKEN_OVER, i.PAUSE): s.PAUSED,  # Resume then gives the arm to the policy
+        (s.TAKEN_OVER, i.MARK_SUCCESS): s.RUNNING,
+        (s.TAKEN_OVER, i.MARK_FAILURE): s.RUNNING,
+        (s.TAKEN_OVER, i.SKIP_TRIAL): s.RUNNING,
+        (s.TAKEN_OVER, h.SUCCEEDED): s.TRIAL_DONE,
+        (s.TAKEN_OVER, h.FAILED_RETRY): s.ADAPTING,
+        (s.TAKEN_OVER, h.FAILED_LAST): s.TRIAL_DONE,
         # pause, and leaving a pause, a stop or a fault: READY for an instant, then what was interrupted goes on
         (s.RUNNING, i.PAUSE): s.PAUSED,
         (s.HOMING, i.PAUSE): s.PAUSED,
@@ -149,7 +179,12 @@ _WHY: dict[Intent, str] = {
     Intent.MARK_SUCCESS: "no attempt is under way or just failed",
     Intent.MARK_FAILURE: "no attempt is under way",
     Intent.SKIP_TRIAL: "no trial is under way that could be skipped",
+    Intent.TAKE_OVER: "only an attempt under way can be taken over",
+    Intent.HAND_BACK: "nobody has taken over",
     Intent.SCENE_READY: "the app does not wait for a scene",
+    Intent.KEEP: "no demonstration waits for your word",
+    Intent.DISCARD: "no demonstration waits for your word",
+    Intent.RECORD_AGAIN: "no demonstration waits for your word",
     Intent.QUIT: "the session has ended",
 }
 

@@ -13,6 +13,8 @@ from enum import StrEnum
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from far_app.device_input import DeviceInput
+
 ACTION_DIM = 7
 """Three translations, three rotations (rotation vector, base frame), the gripper (−1 opens, +1 closes)."""
 ARM_DIMS = 6
@@ -38,6 +40,8 @@ class RobotMode(StrEnum):
     """Following targets."""
     HOMING = "homing"
     """Opening, retreating and going to the start pose; targets are refused, heartbeats keep it alive."""
+    GUIDED = "guided"
+    """A person leads it by hand; targets are refused, heartbeats keep it so."""
     LATCHED = "latched"
     """Still after STOP or a fault; everything but Resume is refused."""
 
@@ -117,6 +121,8 @@ class Observation:
     """The twin's own check of the task at this moment; None on hardware."""
     reward: float = 0.0
     """The twin's shaped reward, in [0, 1]; 0 on hardware."""
+    device: DeviceInput | None = None
+    """An input device at the arm; None without one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +156,7 @@ class Step:
     perturbation: Float[np.ndarray, "A"]
     """δ_t; zeros on a first attempt."""
     commanded: Float[np.ndarray, "A"]
-    """â_t + δ_t, clipped to [−1, 1]."""
+    """â_t + δ_t, clipped to [−1, 1]; its motion fades in over the first ticks after a person handed back."""
     sent: Float[np.ndarray, "A"]
     """ã_t: the action that equals what the safety filter let pass; NaN until acknowledged."""
     chunk_tick: int
@@ -164,6 +170,8 @@ class Step:
     success: bool | None
     lateness: float = float("nan")
     """Seconds from the deadline to the target's acceptance in the hw server."""
+    intervention: bool = False
+    """A person moved the arm: `action` is theirs."""
 
 
 TICK_STAGES = ("observe", "infer", "aggregate", "filter", "send", "record", "publish")

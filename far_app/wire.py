@@ -15,6 +15,7 @@ import msgpack
 import numpy as np
 
 from far_app import protocols, types
+from far_app.device_input import DeviceInput
 from far_app.errors import FarError
 
 WIRE_VERSION = 1
@@ -48,7 +49,9 @@ def register(cls: _T) -> _T:
 for _cls in (
     types.Pose, types.RobotStatus, types.Target, types.Ack, types.Observation, types.ActionChunk, types.Outcome,
     types.RobotMode, types.Judge, types.AdaptationStep, types.Adaptation, types.Contrast, types.FlagCorrection,
-    protocols.Reset, protocols.Home, protocols.Hold, protocols.Resume, protocols.Heartbeat, protocols.Frame,
+    protocols.Reset, protocols.Home, protocols.Hold, protocols.Resume, protocols.Heartbeat, protocols.Guide,
+    protocols.Frame,
+    DeviceInput,
 ):  # fmt: skip
     register(_cls)
 

@@ -99,8 +99,18 @@ def naive_session(
 ) -> tuple[LoopStatistics, Attempt, tuple[float, float]]:
     """Trials under naive retry for so long; returns the last failed attempt too, and when it was. `threads` is filled
     with the processor seconds of each of THREADS."""
-    statistics, inbox = LoopStatistics(), IntentInbox()
     began = time.monotonic()
+    statistics, failure = naive_trials(stage_, seconds, threads)
+    if failure is None:
+        raise FarError(f"no attempt failed within {seconds:g} s, so there is nothing to adapt from; measure for longer")
+    return statistics, failure, (began, time.monotonic())
+
+
+def naive_trials(
+    stage_: Stage, seconds: float, threads: dict[str, float] | None = None
+) -> tuple[LoopStatistics, Attempt | None]:
+    """Trials under naive retry for so long; returns the last failed attempt, if one failed."""
+    statistics, inbox = LoopStatistics(), IntentInbox()
 
     def end() -> None:
         if threads is not None:
@@ -114,9 +124,7 @@ def naive_session(
         session_.run()
     if session_.recorder.error is not None:
         raise session_.recorder.error
-    if session_.last_failure is None:
-        raise FarError(f"no attempt failed within {seconds:g} s, so there is nothing to adapt from; measure for longer")
-    return statistics, session_.last_failure, (began, time.monotonic())
+    return statistics, session_.last_failure
 
 
 def processor_seconds(names: Sequence[str]) -> dict[str, float]:

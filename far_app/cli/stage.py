@@ -16,8 +16,9 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from far_app.cli._person import person_parts
 from far_app.cli.agreement import agreed
 from far_app.cli.assemble import Parts, assemble, check_observation
 from far_app.cli.detector import failure_alarm, learned_detector
@@ -39,6 +40,7 @@ from far_app.session.planners import ThreadedPlanner, plan_one
 from far_app.session.publisher import TelemetryPublisher
 from far_app.session.realtime import prepare_process
 from far_app.session.recorder import Recorder
+from far_app.session.review import Keep, drop
 from far_app.session.session import Session
 from far_app.session.settings import SessionSettings
 from far_app.session.shadow import ShadowRobot
@@ -49,6 +51,7 @@ from far_app.tasks import task as find_task
 from hw.camera_config import with_views
 from hw.rig import RigConfig
 from hw.setup import setup_of
+from ui.access import Access
 
 HARDWARE_PATIENCE = 180.0
 """Seconds for the hw server's first observation (a first start compiles for a while)."""
@@ -57,6 +60,7 @@ COUNTDOWN = 3.0
 """Seconds for which a real arm's attempts are announced."""
 PAGE_SILENCE = 2.0
 """Seconds without a page that someone looks at after which a real arm is held."""
+NO_TAKE_OVER = "the arm is held in a shadow run"
 FIRST_STRETCH = 2
 """Ticks that each tick of a session's first attempt takes on a real arm."""
 
@@ -114,9 +118,11 @@ class Stage:
 
     @contextlib.contextmanager
     def session(
-        self, writer: SessionWriter, inbox: IntentInbox, statistics: LoopStatistics, method: Method | None = None
-    ) -> Iterator[Session]:
-        """A session on this stage, with the page told about it and revived when it dies."""
+        self, writer: SessionWriter, inbox: IntentInbox, statistics: LoopStatistics, method: Method | None = None, *,
+        demonstrate: Literal["", "teleop", "hand"] = "", keep: Keep = drop,
+    ) -> Iterator[Session]:  # fmt: skip
+        """A session on this stage, with the page told about it and revived when it dies; of attempts, or of a person's
+        demonstrations."""
         options = self.options
         publisher = None
         if options.rerun:
@@ -129,12 +135,13 @@ class Stage:
                 session = Session(
                     settings=SessionSettings(
                         name=writer.folder.name, trials=options.trials, seed=options.seed, headless=options.headless,
-                        adaptation_limit=options.retry.adaptation_limit, **self._hardware_rules(),
+                        adaptation_limit=options.retry.adaptation_limit, demonstrate=demonstrate,
+                        no_take_over=NO_TAKE_OVER if options.shadow else "", **self._hardware_rules(),
                     ),
                     robot=robot, planner=ThreadedPlanner(), method=method or self.parts.method,
                     detector=detector, task=self.task, scale=self.rig.scale_for(self.task),
                     recorder=Recorder(writer), inbox=inbox, statistics=statistics, publisher=publisher,
-                    alarm=failure_alarm(options),
+                    alarm=failure_alarm(options), keep=keep,
                 )  # fmt: skip
                 if options.shadow:
                     session.standing.say("shadow run: plans are shown, the arm is held", "warning")
@@ -145,20 +152,22 @@ class Stage:
 
 
 @contextlib.contextmanager
-def stage(options: RunOptions) -> Iterator[Stage]:
-    """Start everything, wait until it is ready, end everything. Raises the FarError of whatever cannot start."""
+def stage(options: RunOptions, person: bool = False) -> Iterator[Stage]:
+    """Start everything, wait until it is ready, end everything. `person`: nobody else acts, no policy is loaded. Raises
+    the FarError of whatever cannot start."""
     rig = options.load_rig()
     task = with_views(find_task(options.task, rig.arm), rig.cameras)
     task = task if rig.robot == "twin" else supervised(task)
+    access = None if options.headless else Access.at(options.page_host, options.page_token)
     port = 0 if options.headless else choose_port(options.page_host, options.port)
     with run_folder() as folder, contextlib.ExitStack() as stack:
         family = Family()
         stack.callback(family.end)
         hardware, rig = find_hardware(folder, family, options, rig)
         page = None if options.headless else family.add(start_page(folder, options, port, task.cameras))
-        parts = assemble(
+        parts = person_parts(task, rig.policy_image) if person else assemble(
             options.method, task, options.policy, options.critic, options.device, options.retry, options.engine
-        )
+        )  # fmt: skip
         attempts = options.max_attempts or parts.max_attempts or task.max_attempts
         task = dataclasses.replace(task, max_attempts=1 if options.shadow else attempts)
         # From here on this process's threads come before the machine's others: one that is not scheduled while it holds
@@ -169,16 +178,16 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         if page is not None:
             wait_for_page(page, options.page_host, port)
         check_observation(parts.method.policy.spec, robot.observe())
-        preflight(
-            parts.method.policy.spec, policy_card(task.name, options.policy), setup_of(rig, task), robot.observe(),
-            options.accept_differences or options.shadow,
-        )  # fmt: skip
+        if not person:
+            preflight(
+                parts.method.policy.spec, policy_card(task.name, options.policy), setup_of(rig, task), robot.observe(),
+                options.accept_differences or options.shadow,
+            )  # fmt: skip
         prepare_process(options.torch_threads)
         warm_up(parts.method.policy, robot)
         yield Stage(
             options=options, task=task, rig=rig, parts=parts, robot=robot, folder=folder, family=family,
-            hardware=hardware, page=page,
-            page_url=f"http://{options.page_host}:{port}" if page is not None else "",
+            hardware=hardware, page=page, page_url=access.url(port) if access is not None else "",
         )  # fmt: skip
 
 
@@ -204,7 +213,9 @@ def start_hardware(folder: Path, rig: str, task: str, address: str) -> Child:
 
 def start_page(folder: Path, options: RunOptions, port: int, cameras: Sequence[str]) -> Child:
     arguments = ["--run-folder", str(folder), "--host", options.page_host, "--port", str(port)]
+    arguments += ["--token", str(options.page_token.absolute())] if options.page_token is not None else []
     arguments += ["--cameras", *cameras, "--recordings", str(options.recordings.absolute())]
+    arguments += ["--operator", options.operator]
     arguments += ["--no-scene3d"] * (not options.scene3d) + ["--no-rerun"] * (not options.rerun)
     return Child("page", "ui.server", arguments, folder)
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from far_app.config import AttributionConfig
-from far_app.learning.attribution import corrected, flag, value_change
+from far_app.learning.attribution import corrected, flag, value_change, without_person
 from far_app.learning.cancellation import Cancelled, check
 from far_app.learning.critic import Critic
 from far_app.learning.pairs import Pairs, distance
@@ -83,7 +83,8 @@ def attributed(
     """The adaptation with every V, every ΔV, and the chunks to blame."""
     found = values(policy, critic, attempt, cancelled)
     changes = value_change(found, policy.config.horizon)
-    flags = flag(changes, config)
+    person = np.array([step.intervention for step in attempt.steps], bool)
+    flags = flag(without_person(changes, person, policy.config.horizon), config)
     return replace(
         adaptation, values=found, value_changes=changes, threshold=flags.threshold, corrections=attempt.corrections,
         flagged=corrected(flags.ticks, attempt.corrections, len(changes)),

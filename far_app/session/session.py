@@ -16,6 +16,7 @@ from far_app.alarm import Alarm
 from far_app.config import TaskConfig
 from far_app.detectors import OperatorOverride
 from far_app.errors import RobotError
+from far_app.guided import guided_trial
 from far_app.motion import ActionScale
 from far_app.protocols import Hold, Method, PlanRequest, Robot, SuccessDetector
 from far_app.scheduling import LOOP_PRIORITY, real_time_inside
@@ -23,18 +24,22 @@ from far_app.session.board import Board
 from far_app.session.clock import TickClock
 from far_app.session.inbox import IntentInbox
 from far_app.session.lessons import Lessons
+from far_app.session.marking import Marking
 from far_app.session.operator import Operator
 from far_app.session.planners import ThreadedPlanner
 from far_app.session.publisher import TelemetryPublisher
 from far_app.session.realtime import collect_between, collector_off
 from far_app.session.recorder import Recorder
+from far_app.session.review import Keep, Review, drop
 from far_app.session.settings import SessionSettings, TrialResult
-from far_app.session.standing import Standing
+from far_app.session.standing import IN_ATTEMPT, Standing
 from far_app.session.statistics import LoopStatistics
+from far_app.session.steering import Helper
 from far_app.session.supervision import Supervision, TrialAbandoned
 from far_app.session.timeline import AGGREGATE, INFER, OBSERVE, PUBLISH, RECORD
+from far_app.session.versions import VersionKeeper
 from far_app.session.watched import WatchedRobot
-from far_app.session_states import Happening, State
+from far_app.session_states import Happening, Intent, State
 from far_app.trial import (
     NO_ALARM,
     Adapted,
@@ -43,9 +48,11 @@ from far_app.trial import (
     AttemptStarted,
     Event,
     Tick,
+    TrialEvents,
     trial,
 )
 from far_app.types import Attempt, Step, Trial
+from far_app.what_if import CorrectFlag
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +73,9 @@ class Session:
         statistics: LoopStatistics,
         publisher: TelemetryPublisher | None = None,
         alarm: Alarm = NO_ALARM,
+        keep: Keep = drop,
     ) -> None:
+        """`keep` takes a demonstration that the operator keeps."""
         self.settings, self.task, self.scale, self.alarm = settings, task, scale, alarm
         self.planner, self.method, self.recorder, self.statistics = planner, method, recorder, statistics
         self.robot = WatchedRobot(robot, statistics)
@@ -77,14 +86,24 @@ class Session:
             chunk_horizon=method.policy.spec.horizon,
         )  # fmt: skip
         self.standing = Standing(
-            robot=self.robot, override=self.detector, recorder=recorder, board=self.board, publisher=publisher
+            robot=self.robot, override=self.detector, recorder=recorder, board=self.board, publisher=publisher,
+        )  # fmt: skip
+        self.standing.withheld[Intent.TAKE_OVER] = settings.no_take_over
+        self.helper = Helper(self.standing, inbox, scale)
+        marking = Marking(self.standing, settings.name)
+        self.versions = VersionKeeper(self.standing, method, recorder.folder)
+        self.inbox, self.operator = (
+            inbox,
+            Operator(inbox, self.standing, self.helper, marking, self.versions, self.clock.period),
         )
-        self.inbox, self.operator = inbox, Operator(inbox, self.standing, self.clock.period)
         self.supervision = Supervision(
-            standing=self.standing, operator=self.operator, planner=planner, clock=self.clock,
+            standing=self.standing, operator=self.operator, helper=self.helper, planner=planner, clock=self.clock,
             freshness=settings.freshness, headless=settings.headless, page_silence=settings.page_silence,
         )  # fmt: skip
-        self.lessons = Lessons(self.standing, session=settings.name, limit=settings.adaptation_limit)
+        self.lessons = Lessons(self.standing, self.versions, session=settings.name, limit=settings.adaptation_limit)
+        self.review = Review(self.standing, self.supervision, self.operator, keep)
+        if settings.demonstrate:
+            self.standing.withheld[Intent.HAND_BACK] = "a demonstration has no policy to hand back to"
         self.results: list[TrialResult] = []
         self.last_failure: Attempt | None = None
         """The newest failed attempt."""
@@ -98,22 +117,35 @@ class Session:
 
     def run(self) -> list[TrialResult]:
         """All trials, or until the operator quits. Raises SessionFault (headless), RecordingError and RobotError."""
-        number = 0
+        number = done = 0
+        scene = self.settings.seed
         try:
             with real_time_inside(LOOP_PRIORITY) as scheduling, collector_off():
                 log.info("the loop is scheduled %s", scheduling)
                 self.robot.refresh()
                 while self._between_trials():
-                    if self.settings.trials and number == self.settings.trials:
+                    if self.settings.trials and done == self.settings.trials:
                         self.standing.happen(Happening.NO_MORE_TRIALS)
                         break
                     if self.settings.await_scene and not self.supervision.await_scene():
                         break
                     number += 1
-                    self._run_trial(number, self.settings.seed + number - 1)
+                    self._run_trial(number, scene)
+                    word = self._reviewed(done) if self.settings.demonstrate else Intent.KEEP
+                    done += word is Intent.KEEP
+                    scene += word is not Intent.RECORD_AGAIN
         finally:
             self._finish()
         return self.results
+
+    def _reviewed(self, kept: int) -> Intent:
+        """The operator's word on the demonstration that has just ended; one that was cut off is discarded."""
+        if self.standing.state is State.FINISHED or not self._attempts:
+            return Intent.DISCARD
+        try:
+            return self.review.ask(self._attempts[-1], kept, self.settings.trials)
+        except TrialAbandoned:
+            return Intent.DISCARD
 
     def _between_trials(self) -> bool:
         """Wait out a stop or a fault; False when the session has ended."""
@@ -129,14 +161,12 @@ class Session:
         self.standing.trial_begins()
         self._seed, self._attempts = seed, []
         self.lessons.trial_begins()
+        self.versions.trial_begins()
         self.board.trial_started(number, seed)
         self.recorder.begin_trial(number, seed)
         self.standing.say(f"trial {number}: scene {seed}")
         self._stretch = self.settings.first_stretch if number == 1 else 1
-        events = trial(
-            seed, self.robot, self.planner, self.method, self.detector, self.task, self.scale, self.lessons.start,
-            self._stretch, self.alarm,
-        )  # fmt: skip
+        events = self._events(seed)
         answer: float | None = None
         try:
             while True:
@@ -149,6 +179,15 @@ class Session:
             events.close()
             self.lessons.end()
             self._account()
+
+    def _events(self, seed: int) -> TrialEvents:
+        """What happens on this scene: Algorithm 1, or a person leading the arm by hand."""
+        if self.settings.demonstrate == "hand":
+            return guided_trial(seed, self.robot, self.detector, self.task, self.scale, self.helper)
+        return trial(
+            seed, self.robot, self.planner, self.method, self.detector, self.task, self.scale, self.lessons.start,
+            self._stretch, self.alarm, self.helper,
+        )  # fmt: skip
 
     def _answer(self, event: Event) -> float | None:
         """What the trial's event asks of a driver in real time."""
@@ -182,8 +221,9 @@ class Session:
         due = self.clock.wait()
         timeline.begin(self._tick - tick.between if tick.phase == "attempt" else -1, due)
         held = self.supervision.attend(tick.phase)
-        if held and tick.phase == "attempt" and self.standing.state is State.RUNNING:
-            self._prime()
+        if held and tick.phase == "attempt" and self.standing.state in IN_ATTEMPT:
+            if self.settings.demonstrate != "hand":
+                self._prime()
             self.clock.restart()
             due = AfterHold(self.clock.wait())
             timeline.restart()
@@ -200,14 +240,19 @@ class Session:
         self.supervision.count_down(self.settings.countdown, f"attempt {event.attempt_index}{pace}")
         self.standing.happen(Happening.AT_HOME)
         self.standing.no_lesson = False
-        self.board.attempt_started(event.attempt_index, event.policy_version)
-        self.recorder.begin_attempt(event.attempt_index, event.policy_version)
+        self.helper.attempt_begins()
+        version = self.versions.attempt_begins(event.policy_version)
+        self.board.attempt_started(event.attempt_index, version)
+        self.recorder.begin_attempt(event.attempt_index, version)
         if slowly:
             self.standing.say(f"attempt {event.attempt_index} runs at 1/{self._stretch} of the policy's speed")
             self.recorder.event("reduced_speed", pace.strip(), {"stretch": self._stretch})
         self._recorded = self._tick = 0
         self._in_attempt = True
-        self._prime()
+        if self.settings.demonstrate:
+            self.operator.ask(Intent.TAKE_OVER, "attempt")
+        if self.settings.demonstrate != "hand":
+            self._prime()
         if event.attempt_index > 1:
             self.statistics.homing.append(time.monotonic() - self._ended)
         self.clock.restart()
@@ -218,6 +263,8 @@ class Session:
             self._record(step)
         self._report(all_times=True)
         self.recorder.end_attempt(attempt)
+        self.board.history.attempt_ended(self.board.trial, attempt)
+        self.versions.attempt_ended(attempt.outcome.success)
         self._in_attempt = False
         self._attempts.append(attempt)
         self.last_failure = self.last_failure if attempt.outcome.success else attempt
@@ -248,9 +295,11 @@ class Session:
         result = Trial(scene_seed=self._seed, attempts=tuple(self._attempts), adaptations=tuple(self.lessons.learnt))
         last = self._attempts[-1].outcome if self._attempts else None
         judged_by = last.judged_by.value if last else ""
-        counted = self._stretch == 1
-        note = last.note if last else "no attempt was finished"
-        self.board.trial_ended(result, judged_by, note if counted else f"began at reduced speed; {note}", counted)
+        helped = any(step.intervention for attempt in self._attempts for step in attempt.steps)
+        counted = self._stretch == 1 and not helped
+        remarks = ["began at reduced speed"] * (self._stretch > 1) + ["a person helped"] * helped
+        note = "; ".join([*remarks, last.note if last else "no attempt was finished"])
+        self.board.trial_ended(result, judged_by, note, counted)
         self.recorder.end_trial(result.success, len(result.attempts))
         self.results.append(
             TrialResult(
@@ -296,6 +345,6 @@ class Session:
         for chunk in self.planner.handed_out():
             self.board.planned(chunk)
             self.recorder.add_chunk(chunk)
-        for asked in self.inbox.words():
+        for asked in self.inbox.take(CorrectFlag):
             self.lessons.correct(asked)
         self.lessons.report()

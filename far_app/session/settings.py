@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +35,11 @@ class SessionSettings:
     """Real arm: seconds for which each attempt is announced; a pause or a stop cancels it."""
     page_silence: float = math.inf
     """Real arm: seconds without a page that someone looks at after which the arm is held until Resume."""
+    no_take_over: str = ""
+    """Why a person cannot take the arm in this session; empty when one can."""
+    demonstrate: Literal["", "teleop", "hand"] = ""
+    """Attempts are a person's: steered (teleop), or the arm is led by hand. Each is then kept, discarded or recorded
+    again, and `trials` counts those that were kept."""
     first_stretch: int = 1
     """Real arm: ticks that each tick of the session's first attempt takes; that trial is left out of statistics."""
 
@@ -47,4 +53,4 @@ class TrialResult:
     success: bool
     judged_by: str
     counted: bool = True
-    """False for a trial that began at reduced speed."""
+    """False for a trial that began at reduced speed, or in which a person helped."""

@@ -19,6 +19,8 @@ class WatchedRobot:
         self.robot = robot
         self.statistics = statistics
         self.newest: Observation | None = None
+        self.gripper = -1.0
+        """As last commanded."""
         self._asked_home = float("-inf")
 
     def refresh(self) -> Observation:
@@ -40,6 +42,7 @@ class WatchedRobot:
 
     def send(self, target: Target) -> None:
         self.statistics.sent(target.seq, target.due)
+        self.gripper = target.gripper
         began = time.perf_counter_ns()
         self.robot.send(target)
         self.statistics.timeline.within(SEND, began)
