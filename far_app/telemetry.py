@@ -13,7 +13,7 @@ from far_app.marks import Judged
 from far_app.session_states import Intent, State
 from far_app.take_over import Steering
 from far_app.trial_plan.shown import PlanShown, SceneShown
-from far_app.types import AdaptationStep, Pose, RobotStatus
+from far_app.types import TICK_STAGES, AdaptationStep, Pose, RobotStatus
 from far_app.wire import register
 
 HIDDEN = "hidden"
@@ -39,6 +39,8 @@ class LoopHealth:
     """Ticks with no plan left."""
     plan_age_ticks: float = 0.0
     """Age of the newest chunk, ticks (recent median)."""
+    stages: Float[np.ndarray, "T S"] = field(default_factory=lambda: np.zeros((0, len(TICK_STAGES)), np.float32))
+    """Milliseconds that each of the last ten seconds' ticks spent on each of TICK_STAGES, newest last."""
 
 
 @register

@@ -95,7 +95,7 @@ class Server:
         self.plant, make_bodies = make_plant(rig, task)
         cameras = rig.cameras
         make_view = (lambda: HardwareView(make_bodies(), cameras)) if cameras else make_bodies
-        controller = ArmController(rig, task, self.plant.servo_hz, self.plant.measure())
+        controller = ArmController(rig, task, self.plant.servo_hz, self.plant.measure(), time.perf_counter)
         self.servo = ServoThread(self.plant, controller, camera_rate=task.rate)
         self.device = InputReader(rig.input_device) if rig.input_device.kind else None
         self.publisher = PublisherThread(

@@ -53,10 +53,19 @@ def running(tick: int = 87, attempt: int = 1) -> Telemetry:
         joints=np.linspace(-1, 1, 7), action=np.full(7, 0.1),
         chunk_path=np.stack([np.linspace(0.4, 0.45, H), np.linspace(0, 0.1, H), np.linspace(0.2, 0.1, H)], axis=1),
         loop=LoopHealth(hz=29.98, ticks=4312, late_p50_ms=0.4, late_p99_ms=1.7, late_max_ms=4.2, late_ticks=0,
-                        plan_age_ticks=1.0),
+                        plan_age_ticks=1.0, stages=stages(4312)),
         history=rows(), log=lines(), allowed=(Intent.STOP, Intent.PAUSE, Intent.MARK_SUCCESS, Intent.MARK_FAILURE,
                                               Intent.SKIP_TRIAL, Intent.QUIT),
     )  # fmt: skip
+
+
+def stages(seed: int) -> np.ndarray:
+    """Ten seconds of ticks with a hiccup."""
+    rng = np.random.default_rng(seed)
+    typical = np.array([0.6, 9.0, 0.9, 0.1, 0.15, 0.3, 0.2], np.float32)
+    ms = typical * rng.gamma(12, 1 / 12, (300, 7)).astype(np.float32)
+    ms[200, 0] = 28.0
+    return ms
 
 
 def adapting() -> Telemetry:
