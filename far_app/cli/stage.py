@@ -156,8 +156,9 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         hardware, rig = find_hardware(folder, family, options, rig)
         page = None if options.headless else family.add(start_page(folder, options, port, task.cameras))
         parts = assemble(
-            options.method, task, options.policy, options.critic, options.device, options.retry, options.engine
-        )
+            options.method, task, options.policy, options.critic, options.device, options.retry, options.engine,
+            threads=options.torch_threads,
+        )  # fmt: skip
         attempts = options.max_attempts or parts.max_attempts or task.max_attempts
         task = dataclasses.replace(task, max_attempts=1 if options.shadow else attempts)
         # From here on this process's threads come before the machine's others: one that is not scheduled while it holds

@@ -9,6 +9,7 @@ import numpy as np
 
 from far_app.config import TaskConfig
 from far_app.motion import ActionScale
+from far_app.protocols import EngineReport
 from far_app.session_states import State, allowed
 from far_app.telemetry import LogLine, Telemetry, TrialRow
 from far_app.types import ActionChunk, Adaptation, AdaptationStep, Observation, Step, Trial
@@ -41,6 +42,7 @@ class Board:
         self.adapting = False
         self.trial = self.attempt = self.scene_seed = 0
         self.policy_version = ""
+        self.engine = EngineReport(name="")
 
     def log(self, text: str, level: str = "info") -> None:
         self._log.append(LogLine(stamp=time.monotonic(), level=level, text=text))
@@ -54,6 +56,13 @@ class Board:
     def attempt_started(self, attempt: int, policy_version: str) -> None:
         self.attempt, self.policy_version = attempt, policy_version
         self._clear()
+
+    def runs_on(self, engine: EngineReport) -> None:
+        """What runs the policy of the attempt; an engine that was refused since the last word is said once."""
+        for refused in engine.refused:
+            if refused not in self.engine.refused:
+                self.log(f"engine refused, {refused}; {engine.name} runs the policy", "warning")
+        self.engine = engine
 
     def stepped(self, step: Step) -> None:
         """V of a tick often arrives with a later one; the curve has one entry a tick, NaN where there is none."""
@@ -95,8 +104,9 @@ class Board:
             status = "update" if self.adaptation_steps else "attribution" if latest is None else "candidates"
         return Telemetry(
             seq=0, stamp=0.0, state=state, reason=self.reason, countdown=self.countdown, session=self._session,
-            task=self._task.name, method=self._method, policy_version=self.policy_version, trial=self.trial,
-            trials=self._trials, attempt=self.attempt, max_attempts=self._task.max_attempts, scene_seed=self.scene_seed,
+            task=self._task.name, method=self._method, policy_version=self.policy_version, engine=self.engine.name,
+            engine_refused=self.engine.refused, trial=self.trial, trials=self._trials, attempt=self.attempt,
+            max_attempts=self._task.max_attempts, scene_seed=self.scene_seed,
             tick=len(self._values), horizon=self._task.horizon, rate=self._task.rate, chunk_horizon=self._chunk_horizon,
             values=np.array(values, dtype=float),
             value_changes=curve.value_changes if curve else np.zeros(0),

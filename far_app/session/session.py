@@ -18,7 +18,7 @@ from far_app.config import TaskConfig
 from far_app.detectors import OperatorOverride
 from far_app.errors import RobotError
 from far_app.motion import ActionScale
-from far_app.protocols import Hold, KeepsWeights, Method, PlanRequest, Robot, SuccessDetector
+from far_app.protocols import Hold, KeepsWeights, Method, PlanRequest, Robot, RunsOnEngine, SuccessDetector
 from far_app.scheduling import LOOP_PRIORITY, real_time_inside
 from far_app.session.adaptation import BackgroundAdaptation, unchanged
 from far_app.session.board import Board
@@ -227,6 +227,8 @@ class Session:
         self.supervision.happen(Happening.AT_HOME)
         self.supervision.no_lesson = False
         self.board.attempt_started(event.attempt_index, event.policy_version)
+        if isinstance(self.method.policy, RunsOnEngine):
+            self.board.runs_on(self.method.policy.runs_on)
         self.recorder.begin_attempt(event.attempt_index, event.policy_version)
         if slowly:
             self.supervision.say(f"attempt {event.attempt_index} runs at 1/{self._stretch} of the policy's speed")

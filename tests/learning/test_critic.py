@@ -268,7 +268,7 @@ def test_an_own_encoder_is_trained_saved_and_used(tmp_path):
     attempt = small_attempt(ticks=9)
     histories = [(attempt.steps[0].observation, attempt.steps[1].observation)]
     features = policy.encode(histories)
-    assert not torch.allclose(critic.see(histories, features), features, atol=1e-4)
+    assert not torch.allclose(critic.see(histories, features, FeatureMemory()), features, atol=1e-4)
     assert sum(v.numel() for v in critic.state_dict().values()) > sum(p.numel() for p in policy.encoder.parameters())
 
 
