@@ -129,7 +129,7 @@ def episode_record(arm: str, scene: int, result: Trial) -> dict[str, Any]:
             }
             for a in result.adaptations
         ],
-    }  # fmt: skip
+    } | ({"rescues": result.rescues} if result.rescues else {})  # fmt: skip
 
 
 Episode = tuple[str, int]

@@ -286,6 +286,8 @@ class Trial:
     scene_seed: int
     attempts: tuple[Attempt, ...]
     adaptations: tuple[Adaptation, ...]
+    rescues: int = 0
+    """How often the arm had to be freed by hand (counted in lockstep)."""
 
     @property
     def success(self) -> bool:

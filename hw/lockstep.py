@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from far_app.config import TaskConfig
 from far_app.errors import RobotError
-from far_app.protocols import Request, Reset
+from far_app.protocols import Home, Request, Reset, Resume
 from far_app.types import Observation, RobotMode, Target
 from hw.controller import ArmController
 from hw.observing import observation
-from hw.plant import Plant, PlantView
+from hw.plant import PlantView, SimulatedPlant
 from hw.rig import RigConfig
 
 
@@ -21,7 +21,12 @@ class LockstepRobot:
     """far_app.protocols.Robot around a plant whose time is simulated."""
 
     def __init__(
-        self, plant: Plant, view: PlantView | None, rig: RigConfig, task: TaskConfig, render_homing: bool = False
+        self,
+        plant: SimulatedPlant,
+        view: PlantView | None,
+        rig: RigConfig,
+        task: TaskConfig,
+        render_homing: bool = False,
     ) -> None:
         """Without a view observations hold no images. Unless render_homing, none are drawn while the arm goes home.
         The view stays its maker's (several robots of one rig and task may share one)."""
@@ -78,6 +83,17 @@ class LockstepRobot:
         else:
             self.controller.request(request, self.now)
         self._observation = None
+
+    def free(self) -> bool:
+        """What an operator does with an arm that latched: takes it out of what it is caught in, puts it at its start
+        pose, resumes and sends it home; the objects stay. False when it was not latched."""
+        if self.controller.status().mode is not RobotMode.LATCHED:
+            return False
+        self.request(Resume())
+        self.plant.free()
+        self.controller.reset(self.plant.measure(), self.controller.scene_seed)
+        self.request(Home())
+        return True
 
     def close(self) -> None:
         self._closed = True

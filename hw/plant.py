@@ -77,6 +77,14 @@ class Plant(Protocol):
         ...
 
 
+class SimulatedPlant(Plant, Protocol):
+    """A Plant whose arm can be put somewhere else at no cost."""
+
+    def free(self) -> None:
+        """The arm at its start pose, at rest, hand open; the objects stay where they are."""
+        ...
+
+
 class PlantView(Protocol):
     """Draws snapshots; lives in the camera thread, which owns its GL context (make it there)."""
 

@@ -149,14 +149,22 @@ class TwinPlant:
         self._bind()
         if self.rig.start_joints:
             self.data.qpos[self._arm_qpos] = self.rig.start_joints
+        self.osc.posture = self.data.qpos[self._arm_qpos].copy()
+        self._settle()
+
+    def free(self) -> None:
+        self.data.qpos[self._arm_qpos] = self.osc.posture
+        self.data.qpos[self._finger_qpos] = self._wide
+        self._settle()
+
+    def _settle(self) -> None:
+        """At rest where it stands, hand open: objects settle on the table, the arm takes its weight."""
         self.data.qvel[:] = 0.0
         mujoco.mj_forward(self.model, self.data)
         self._grip = self._grip_target = -1.0
-        self.osc.posture = self.data.qpos[self._arm_qpos].copy()
-        measured = self.measure()
-        self.servo(measured.eef, -1.0)
+        self.servo(self.measure().eef, -1.0)
         for _ in range(SERVO_HZ // 4):
-            self.advance()  # objects settle on the table, the arm takes its weight
+            self.advance()
         self._ticks = 0
 
     def measure(self) -> Measured:

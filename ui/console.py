@@ -19,6 +19,7 @@ from far_app.session_states import Intent, State
 from far_app.telemetry import Telemetry, View
 from far_app.types import RobotMode
 from ui import html
+from ui.keys import Page, add_hotkey, hint, key_of
 from ui.page_server import Presses
 from ui.plots import Plots
 from ui.scene3d import BRAND, FLAGGED, Scene3D
@@ -37,8 +38,6 @@ _BLANK = np.full((8, 8, 3), 8, np.uint8)
 class _Button:
     intent: Intent
     label: str
-    key: Any
-    """Hotkey; None for what must be clicked."""
     color: tuple[int, int, int]
     box: tuple[float, float, float, float]
     """Left, top, width, height in page units, below the head."""
@@ -48,19 +47,19 @@ _QUIET, _GREEN, _AMBER = (36, 50, 65), (31, 122, 77), (140, 92, 16)
 _COLUMNS, _WIDTH, _HEIGHT = (0.7, 12.15), 10.85, 4.3
 
 
-def _control(intent: Intent, label: str, key: Any, color: tuple[int, int, int], column: int, row: int) -> _Button:
+def _control(intent: Intent, label: str, color: tuple[int, int, int], column: int, row: int) -> _Button:
     box = (_COLUMNS[column], 11.7 + 4.9 * row, _WIDTH, _HEIGHT)
-    return _Button(intent=intent, label=label, key=key, color=color, box=box)
+    return _Button(intent=intent, label=label, color=color, box=box)
 
 
 _BUTTONS = (
-    _control(Intent.PAUSE, "Pause", "P", _QUIET, 0, 0),
-    _control(Intent.RESUME, "Resume", "R", BRAND, 1, 0),
-    _control(Intent.MARK_SUCCESS, "Mark success", "S", _GREEN, 0, 1),
-    _control(Intent.MARK_FAILURE, "Mark failure", "F", _AMBER, 1, 1),
-    _control(Intent.SKIP_TRIAL, "Skip trial", "K", _QUIET, 0, 2),
-    _control(Intent.SCENE_READY, "Scene ready", "N", BRAND, 1, 2),
-    _Button(intent=Intent.QUIT, label="End session", key=None, color=_QUIET, box=(0.7, 26.4, 22.3, 3.3)),
+    _control(Intent.PAUSE, "Pause", _QUIET, 0, 0),
+    _control(Intent.RESUME, "Resume", BRAND, 1, 0),
+    _control(Intent.MARK_SUCCESS, "Mark success", _GREEN, 0, 1),
+    _control(Intent.MARK_FAILURE, "Mark failure", _AMBER, 1, 1),
+    _control(Intent.SKIP_TRIAL, "Skip trial", _QUIET, 0, 2),
+    _control(Intent.SCENE_READY, "Scene ready", BRAND, 1, 2),
+    _Button(intent=Intent.QUIT, label="End session", color=_QUIET, box=(0.7, 26.4, 22.3, 3.3)),
 )
 
 
@@ -101,7 +100,8 @@ class Console:
         self._head = gui.add_html(html.head(banner(None, fresh), arm_word(None)))
         stop = gui.add_button("STOP", color=FLAGGED)
         self._stop_note = gui.add_html(html.stop_note(None, False, ""))
-        hotkey = gui.add_command("STOP the arm", description="Latches the arm at once", hotkey="space")
+        hotkey = self._hotkey(Intent.STOP, "STOP the arm")
+        assert hotkey is not None
 
         self._presses.on(stop, lambda: self._press_stop("page: button"))
         self._presses.on(hotkey, lambda: self._press_stop("page: space key"))
@@ -119,12 +119,15 @@ class Console:
         handle = self._gui.add_button(button.label, disabled=True, color=button.color)
 
         self._presses.on(handle, lambda: self._press(button.intent))
-        command = None
-        if button.key is not None:
-            command = self._gui.add_command(button.label, hotkey=button.key, disabled=True)
+        command = self._hotkey(button.intent, button.label, disabled=True)
+        if command is not None:
             self._presses.on(command, lambda: self._press(button.intent, by_key=True))
         self._controls[button.intent] = (button, handle, command)
         return _place(handle, button.box)
+
+    def _hotkey(self, action: str, label: str, *, disabled: bool = False) -> viser.CommandHandle | None:
+        key = key_of(Page.CONSOLE, action)
+        return add_hotkey(self._gui, key, label, disabled=disabled) if key is not None else None
 
     def _add_cameras(self) -> None:
         for camera, place in zip(self._cameras, PLACES, strict=False):
@@ -153,7 +156,7 @@ class Console:
             return "the arm may move"
         if button.intent is Intent.QUIT and time.monotonic() < self._ending_until:
             return "click again to end it"
-        return f"key {button.key}" if button.key else ""
+        return hint(Page.CONSOLE, button.intent)
 
     def refuse(self, intent: Intent, reason: str) -> None:
         """Say on the page that a press had no effect, and why."""

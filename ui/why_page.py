@@ -13,6 +13,7 @@ import numpy as np
 import viser
 
 from ui import why_html
+from ui.keys import Page, add_hotkey, hint, key_of
 from ui.page_server import Presses
 from ui.scene3d import BRAND
 from ui.why_model import Attribution, Case
@@ -24,17 +25,17 @@ _QUIET, _AMBER, _VIOLET = (36, 50, 65), (140, 92, 16), (86, 52, 150)
 _SETTLE = 0.8
 """Seconds after a slider's last move before it is set for the other viewers too."""
 
-_BUTTONS: tuple[tuple[Press, str, Any, tuple[int, int, int], int, int], ...] = (
-    (Press.PREVIOUS, "◀ Flagged", "B", BRAND, 0, 0),
-    (Press.NEXT, "Flagged ▶", "N", BRAND, 1, 0),
-    (Press.EARLIER, "◀ Tick", "arrowleft", _QUIET, 0, 1),
-    (Press.LATER, "Tick ▶", "arrowright", _QUIET, 1, 1),
-    (Press.ATTEMPT_PREVIOUS, "◀ Attempt", "arrowup", _QUIET, 0, 2),
-    (Press.ATTEMPT_NEXT, "Attempt ▶", "arrowdown", _QUIET, 1, 2),
-    (Press.CORRECT, "Correct", "F", _AMBER, 0, 3),
-    (Press.ADAPT, "Adapt again", "G", _VIOLET, 1, 3),
-    (Press.CRITIC, "Critic", "C", _QUIET, 0, 4),
-    (Press.RESET, "As recorded", "R", _QUIET, 1, 4),
+_BUTTONS: tuple[tuple[Press, str, tuple[int, int, int], int, int], ...] = (
+    (Press.PREVIOUS, "◀ Flagged", BRAND, 0, 0),
+    (Press.NEXT, "Flagged ▶", BRAND, 1, 0),
+    (Press.EARLIER, "◀ Tick", _QUIET, 0, 1),
+    (Press.LATER, "Tick ▶", _QUIET, 1, 1),
+    (Press.ATTEMPT_PREVIOUS, "◀ Attempt", _QUIET, 0, 2),
+    (Press.ATTEMPT_NEXT, "Attempt ▶", _QUIET, 1, 2),
+    (Press.CORRECT, "Correct", _AMBER, 0, 3),
+    (Press.ADAPT, "Adapt again", _VIOLET, 1, 3),
+    (Press.CRITIC, "Critic", _QUIET, 0, 4),
+    (Press.RESET, "As recorded", _QUIET, 1, 4),
 )
 
 
@@ -93,11 +94,11 @@ class WhyPage:
         self._foot = gui.add_html(why_html.foot("", (), "", ""))
         gui.add_html(f"<style>{_STYLE}\n@media (min-width: 768px) {{ {' '.join(places)} }}</style>")
 
-    def _add_button(
-        self, press: Press, label: str, key: Any, color: tuple[int, int, int], column: int, row: int
-    ) -> str:
+    def _add_button(self, press: Press, label: str, color: tuple[int, int, int], column: int, row: int) -> str:
         handle = self._gui.add_button(label, disabled=True, color=color)
-        command = self._gui.add_command(label, hotkey=key, disabled=True)
+        key = key_of(Page.WHY, press)
+        assert key is not None
+        command = add_hotkey(self._gui, key, label, disabled=True)
         self._presses.on(handle, lambda: self.events.put((press, 0.0)))
         self._presses.on(command, lambda: self.events.put((press, 0.0)))
         self._buttons[press] = (label, handle, command)
@@ -135,7 +136,8 @@ class WhyPage:
         for press, (label, handle, command) in self._buttons.items():
             offer = s.offers[press]
             handle.disabled, command.disabled = not offer.enabled, not offer.enabled
-            handle.label = f"{names.get(press, label)}\n{offer.line}"
+            line = f"{offer.line} · {hint(Page.WHY, press)}".removeprefix(" · ") if offer.enabled else offer.line
+            handle.label = f"{names.get(press, label)}\n{line}"
         self._set_sliders(s)
         if self._scene is not None:
             key = (id(case), id(found), tick, id(s.moved))

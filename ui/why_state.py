@@ -77,7 +77,7 @@ class Offer:
 
     enabled: bool
     line: str = ""
-    """Below its label: a hint, or why not."""
+    """Below its label: a word on what it does, or why it cannot; the page adds its key."""
 
 
 def offers(
@@ -98,11 +98,10 @@ def offers(
     changed = "" if not looking.choice.recorded else "nothing is changed"
     first, last = looking.attempt <= 0, looking.attempt >= attempts - 1
     rows = {
-        Press.PREVIOUS: (flags, "key B"), Press.NEXT: (flags, "key N"),
-        Press.EARLIER: (nothing, "key ←"), Press.LATER: (nothing, "key →"),
-        Press.ATTEMPT_PREVIOUS: ("the first" if first else "", "key ↑"),
-        Press.ATTEMPT_NEXT: ("the last" if last else "", "key ↓"),
-        Press.CORRECT: (correct, "not to blame · key F" if marked else "to blame · key F"),
-        Press.CRITIC: (one, "key C"), Press.RESET: (changed, "key R"), Press.ADAPT: (adapt, "key G"),
+        Press.PREVIOUS: (flags, ""), Press.NEXT: (flags, ""), Press.EARLIER: (nothing, ""), Press.LATER: (nothing, ""),
+        Press.ATTEMPT_PREVIOUS: ("the first" if first else "", ""),
+        Press.ATTEMPT_NEXT: ("the last" if last else "", ""),
+        Press.CORRECT: (correct, "not to blame" if marked else "to blame"),
+        Press.CRITIC: (one, ""), Press.RESET: (changed, ""), Press.ADAPT: (adapt, ""),
     }  # fmt: skip
     return {press: Offer(enabled=not why, line=why or hint) for press, (why, hint) in rows.items()}

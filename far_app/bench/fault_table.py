@@ -46,7 +46,7 @@ class Bench:
 
     @property
     def state(self) -> State:
-        return self.session.supervision.state
+        return self.session.standing.state
 
     def stop(self) -> None:
         """STOP as the page sends it: straight to the hw server."""

@@ -85,7 +85,7 @@ class Run:
 
     @property
     def state(self) -> State:
-        return self.session.supervision.state
+        return self.session.standing.state
 
     @property
     def holds(self) -> int:

@@ -78,11 +78,11 @@ def side_by_side(
     """Trials of whatever `take` hands out; `cast` names the scene of a job and its method on a lane; an alarm for each
     robot, or none."""
     from far_app.detectors import TwinCheck
-    from far_app.session.lockstep import Advance, Lane, adapt_at_once, run_together
+    from far_app.session.lockstep import Lane, adapt_at_once, run_together
     from far_app.session.planners import LockstepPlanner
-    from far_app.trial import NO_ALARM, TrialEvents, trial
+    from far_app.trial import NO_ALARM, trial
 
-    def start(job: J, lane: int) -> tuple[TrialEvents, Advance]:
+    def start(job: J, lane: int) -> Lane:
         robot = robots[lane]
         robot.request(Resume())
         scene, method = cast(job, lane)
@@ -90,12 +90,14 @@ def side_by_side(
             scene, robot, LockstepPlanner(), method, TwinCheck(task.success_ticks), task, robot.scale, adapt_at_once,
             alarm=alarms[lane] if alarms else NO_ALARM,
         )  # fmt: skip
-        return events, robot.advance
+        return Lane(events, robot.advance, robot.free)
 
     def failed(job: J, lane: Lane, error: RobotError) -> Trial:
-        """The arm latched (it could not get home, say): the trial ends as it stands."""
+        """The arm latched too often: the trial ends as it stands."""
         scene, method = cast(job, 0)
         log.warning("scene %d, %s: %s", scene, method.name, error)
-        return Trial(scene_seed=scene, attempts=tuple(lane.attempts), adaptations=tuple(lane.adaptations))
+        return Trial(
+            scene_seed=scene, attempts=tuple(lane.attempts), adaptations=tuple(lane.adaptations), rescues=lane.rescues
+        )
 
     return run_together(take, len(robots), start, failed)

@@ -18,7 +18,7 @@ from far_app.config import RetryConfig
 from far_app.endpoints import Endpoints
 from far_app.errors import ConfigError
 from far_app.session.inbox import IntentInbox
-from far_app.session.session import TrialResult
+from far_app.session.settings import TrialResult
 from far_app.session.statistics import LoopStatistics
 from far_app.session.supervision import SessionFault
 from far_app.session_states import Intent

@@ -39,7 +39,8 @@ from far_app.session.planners import ThreadedPlanner, plan_one
 from far_app.session.publisher import TelemetryPublisher
 from far_app.session.realtime import prepare_process
 from far_app.session.recorder import Recorder
-from far_app.session.session import Session, SessionSettings
+from far_app.session.session import Session
+from far_app.session.settings import SessionSettings
 from far_app.session.shadow import ShadowRobot
 from far_app.session.statistics import LoopStatistics
 from far_app.station import station_at
@@ -136,7 +137,7 @@ class Stage:
                     alarm=failure_alarm(options),
                 )  # fmt: skip
                 if options.shadow:
-                    session.supervision.say("shadow run: plans are shown, the arm is held", "warning")
+                    session.standing.say("shadow run: plans are shown, the arm is held", "warning")
                 yield session
         finally:
             if publisher is not None:

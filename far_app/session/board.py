@@ -43,6 +43,7 @@ class Board:
         self.trial = self.attempt = self.scene_seed = 0
         self.policy_version = ""
         self.engine = EngineReport(name="")
+        """What runs the policy of the attempt."""
 
     def log(self, text: str, level: str = "info") -> None:
         self._log.append(LogLine(stamp=time.monotonic(), level=level, text=text))
@@ -56,13 +57,6 @@ class Board:
     def attempt_started(self, attempt: int, policy_version: str) -> None:
         self.attempt, self.policy_version = attempt, policy_version
         self._clear()
-
-    def runs_on(self, engine: EngineReport) -> None:
-        """What runs the policy of the attempt; an engine that was refused since the last word is said once."""
-        for refused in engine.refused:
-            if refused not in self.engine.refused:
-                self.log(f"engine refused, {refused}; {engine.name} runs the policy", "warning")
-        self.engine = engine
 
     def stepped(self, step: Step) -> None:
         """V of a tick often arrives with a later one; the curve has one entry a tick, NaN where there is none."""

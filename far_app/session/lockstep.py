@@ -6,7 +6,7 @@ Called by tests, benchmarks and evaluations; the robot lives in the same process
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from far_app.errors import RobotError
@@ -17,6 +17,8 @@ from far_app.types import ActionChunk, Adaptation, Attempt, Judge, Trial
 
 Advance = Callable[[], float]
 """Lets one tick of a robot's time pass and returns the new time, seconds."""
+MOST_RESCUES = 10
+"""In one trial; then it is given up."""
 
 
 @dataclass
@@ -25,6 +27,11 @@ class Lane:
 
     events: TrialEvents
     advance: Advance
+    free: Callable[[], bool] = lambda: False
+    """The operator's part: takes a latched arm out of what it is caught in, hand open, and sends it
+    home; objects stay. False when there was nothing to free, or nobody to do it."""
+    rescues: int = 0
+    """How often that was needed."""
     answer: float | ActionChunk | None = None
     attempts: list[Attempt] = field(default_factory=list)
     adaptations: list[Adaptation] = field(default_factory=list)
@@ -36,18 +43,28 @@ class Lane:
             try:
                 event = self.events.send(self.answer)
             except StopIteration as end:
-                return end.value
+                return replace(end.value, rescues=self.rescues)
             self.answer = None
             if isinstance(event, Tick):
                 self.answer = self.advance()
+                if event.phase == "homing":
+                    self._rescued()
             elif isinstance(event, PlanRequest):
                 return event
             elif isinstance(event, AttemptEnded):
-                if event.attempt.outcome.judged_by is Judge.FAULT:  # nobody is here to see to it and resume
+                if event.attempt.outcome.judged_by is Judge.FAULT and not self._rescued():
                     raise RobotError(event.attempt.outcome.note)
                 self.attempts.append(event.attempt)
             elif isinstance(event, Adapted):
                 self.adaptations.append(event.adaptation)
+
+    def _rescued(self) -> bool:
+        if not self.free():
+            return False
+        self.rescues += 1
+        if self.rescues > MOST_RESCUES:
+            raise RobotError(f"the arm latched {self.rescues} times in one trial (limit {MOST_RESCUES}); given up")
+        return True
 
 
 def run_lockstep(events: TrialEvents, advance: Advance) -> Trial:
@@ -61,8 +78,8 @@ def run_lockstep(events: TrialEvents, advance: Advance) -> Trial:
 J = TypeVar("J", bound=Hashable)
 Take = Callable[[], J | None]
 """The next job; None while there is none (one that ends may bring more)."""
-Start = Callable[[J, int], tuple[TrialEvents, Advance]]
-"""(job, lane) → its trial, on that lane's robot."""
+Start = Callable[[J, int], Lane]
+"""(job, number of the lane) → its trial, on that lane's robot."""
 
 
 def run_together(
@@ -74,7 +91,7 @@ def run_together(
     while True:
         for number in range(lanes):
             if number not in running and (job := take()) is not None:
-                running[number] = job, Lane(*start(job, number))
+                running[number] = job, start(job, number)
         if not running:
             return
         requests: dict[int, PlanRequest] = {}

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from far_app.demonstrations import demonstrate
-from far_app.motion import rotation_between
+from far_app.motion import TargetIntegrator, rotation_between
+from far_app.protocols import Hold, Reset
 from far_app.tasks import task
-from far_app.types import Pose
+from far_app.types import Pose, RobotMode
 from hw.lockstep import LockstepRobot
 from hw.rig import load_rig
 from hw.twin import SERVO_HZ, TwinPlant
@@ -80,6 +81,23 @@ def test_a_commanded_pose_is_reached(plant):
     measured = plant.measure()
     assert measured.eef.position == pytest.approx(goal.position, abs=0.003)
     assert measured.gripper < 0.1
+
+
+def test_freeing_a_latched_arm_puts_it_at_its_start_pose_and_leaves_the_objects(plant):
+    robot = LockstepRobot(plant, None, RIG, TASK)
+    robot.request(Reset(seed=3))
+    start, cube = robot.observe().eef, robot.observe().objects["cube"]
+    integrator = TargetIntegrator(RIG.scale, start)
+    for _ in range(20):
+        robot.send(integrator.target(np.array([0, 0.5, 0.2, 0, 0, 0, 1.0]), robot.observe().eef, robot.now))
+        robot.advance()
+    assert not robot.free(), "there is nothing to free"
+    robot.request(Hold(reason="caught", latch=True))
+    assert robot.free()
+    freed = robot.observe()
+    assert freed.status.mode is RobotMode.HOMING and freed.gripper > 0.95
+    assert freed.eef.position == pytest.approx(start.position, abs=0.003)
+    assert freed.objects["cube"].position == pytest.approx(cube.position, abs=0.002)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import pytest
 from far_app.detectors import PersonJudge, TwinCheck
 from far_app.errors import RecordingError
 from far_app.motion import ActionScale
-from far_app.protocols import Hold, Home, Resume
+from far_app.protocols import EngineReport, Hold, Home, Resume
 from far_app.recording.inspect import inspect_session
 from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
@@ -20,9 +20,10 @@ from far_app.session.adaptation import unchanged
 from far_app.session.inbox import IntentInbox
 from far_app.session.planners import ThreadedPlanner
 from far_app.session.recorder import Recorder
-from far_app.session.session import Session, SessionSettings
+from far_app.session.session import Session
+from far_app.session.settings import Freshness, SessionSettings
 from far_app.session.statistics import LoopStatistics
-from far_app.session.supervision import Freshness, SessionFault
+from far_app.session.supervision import SessionFault
 from far_app.session_states import Intent, State
 from far_app.tasks import task
 from far_app.types import Judge
@@ -33,7 +34,7 @@ class Desk:
     """A session with everything a test may want to touch."""
 
     def __init__(self, robot=None, policy=None, adapting_seconds=0.0, horizon=20, attempts=3, detector=None,
-                 **settings) -> None:  # fmt: skip
+                 writer=None, **settings) -> None:  # fmt: skip
         self.robot = robot or KinematicRobot()
         self.method = Faster(policy or Forward(), adapting_seconds)
         self.inbox = IntentInbox()
@@ -41,13 +42,13 @@ class Desk:
         settings = {"name": "test", "trials": 1, "seed": 5, "headless": True} | settings
         self.session = Session(
             settings=SessionSettings(**settings), robot=self.robot, planner=ThreadedPlanner(), method=self.method,
-            detector=detector or TwinCheck(2), scale=ActionScale(), recorder=Recorder(), inbox=self.inbox,
+            detector=detector or TwinCheck(2), scale=ActionScale(), recorder=Recorder(writer), inbox=self.inbox,
             task=replace(task("lift"), horizon=horizon, max_attempts=attempts, rate=50.0), statistics=self.statistics,
         )  # fmt: skip
 
     @property
     def state(self) -> State:
-        return self.session.supervision.state
+        return self.session.standing.state
 
     def when(self, condition, act) -> None:
         """In a thread: as soon as the condition holds, act."""
@@ -102,7 +103,7 @@ def test_an_adaptation_over_its_limit_is_cancelled_and_the_previous_version_retr
     began = time.monotonic()
     desk.session.run()
     assert time.monotonic() - began < 10
-    assert [a.status for a in desk.session._adaptations] == ["timeout"]
+    assert [a.status for a in desk.session.lessons.learnt] == ["timeout"]
     assert [a.policy_version for a in desk.session._attempts] == ["forward-0", "forward-0"]
 
 
@@ -254,7 +255,7 @@ def test_the_page_sees_the_flags_while_the_arm_goes_home():
     desk = Desk(policy=Forward(speed=0.01), horizon=5, attempts=2)
     desk.session.method = desk.method = Telling(Forward(speed=0.01))
     shown = []
-    desk.session.supervision.show = lambda: shown.append(desk.session.board.telemetry(desk.state, None))
+    desk.session.standing.show = lambda: shown.append(desk.session.board.telemetry(desk.state, None))
     desk.session.run()
     adapting = [t for t in shown if t.state is State.ADAPTING]
     assert any(t.flagged == (1,) and t.adaptation_status == "candidates" and len(t.values) == 6 for t in adapting)
@@ -264,9 +265,8 @@ def test_the_page_sees_the_flags_while_the_arm_goes_home():
 
 
 def test_a_full_disk_ends_the_session_with_the_arm_held_and_what_was_recorded_readable(tmp_path):
-    desk = Desk(policy=Forward(speed=0.01), horizon=10)
     writer = SessionWriter(tmp_path, SessionInfo(task="lift", method="test"), space_to_start=0, space_to_go_on=10**18)
-    desk.session.recorder = desk.session.supervision.recorder = Recorder(writer)
+    desk = Desk(policy=Forward(speed=0.01), horizon=10, writer=writer)
     with pytest.raises(RecordingError, match="free"):
         desk.session.run()
     assert isinstance(desk.robot.requests[-1], Hold)
@@ -297,3 +297,16 @@ def test_stop_while_a_person_is_asked_ends_the_attempt():
     desk.when(lambda: desk.state is State.STOPPED, lambda: desk.inbox.put(Intent.RESUME))
     (result,) = desk.session.run()
     assert (result.success, result.judged_by) == (False, "operator")
+
+
+def test_what_runs_the_policy_is_shown_and_a_refused_engine_is_told_once():
+    class OnEngine(Forward):
+        runs_on = EngineReport(name="arranged", why="fastest here", refused=("openvino: it differs by 0.1",))
+
+    desk = Desk(policy=OnEngine(), trials=2)
+    desk.session.run()
+    shown = desk.session.board.telemetry(desk.state, None)
+    assert (shown.engine, shown.engine_refused) == ("arranged", ("openvino: it differs by 0.1",))
+    told = [line for line in shown.log if "refused" in line.text]
+    assert [line.level for line in told] == ["warning"]
+    assert told[0].text == "engine refused, openvino: it differs by 0.1; arranged runs the policy"
