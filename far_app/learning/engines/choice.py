@@ -16,7 +16,7 @@ import logging
 import os
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -68,25 +68,26 @@ def fastest(network: DiffusionPolicy, threads: int = 1, file: Path | None = None
 
 def measured(network: DiffusionPolicy, names: tuple[str, ...], threads: int) -> dict[str, float]:
     """Median milliseconds of a chunk from new observations, by engine; those that cannot be built are left out."""
-    found = {}
+    engines: dict[str, Engine] = {}
+    for name in names:
+        try:
+            engines[name] = ENGINES[name].make(network, "measured", False)
+        except (FarError, RuntimeError) as error:
+            log.warning("engine %s is not measured: %s", name, error)
     with torch_threads(threads):
-        for name in names:
-            try:
-                engine = ENGINES[name].make(network, "measured", False)
-                found[name] = round(median_ms(engine, network), 3)
-            except (FarError, RuntimeError) as error:
-                log.warning("engine %s is not measured: %s", name, error)
-    return found
+        return {name: round(float(np.median(ms)), 3) for name, ms in taking_turns(engines, network).items()}
 
 
-def median_ms(engine: Engine, network: DiffusionPolicy) -> float:
-    spent = []
+def taking_turns(engines: Mapping[str, Engine], network: DiffusionPolicy) -> dict[str, list[float]]:
+    """Milliseconds of each chunk; whatever else the machine does falls on all engines alike."""
+    spent: dict[str, list[float]] = {name: [] for name in engines}
     for _ in range(WARM_UP + REPEATS):
-        histories, noise = probe(network, 1)
-        began = time.perf_counter()
-        engine.plan(histories, noise)[1].cpu()
-        spent.append((time.perf_counter() - began) * 1e3)
-    return float(np.median(spent[WARM_UP:]))
+        for name, engine in engines.items():
+            histories, noise = probe(network, 1)
+            began = time.perf_counter()
+            engine.plan(histories, noise)[1].cpu()
+            spent[name].append((time.perf_counter() - began) * 1e3)
+    return {name: ms[WARM_UP:] for name, ms in spent.items()}
 
 
 def fingerprint_of(network: DiffusionPolicy, names: tuple[str, ...], threads: int) -> str:
