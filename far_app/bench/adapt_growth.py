@@ -30,14 +30,14 @@ def growth(preset: str, repeats: int = 3) -> list[dict[str, Any]]:
     for grows, to, ticks, candidates in points:
         attempt = failed_attempt(network, ticks)
         retry = RetryConfig(pairs=PairsConfig(candidates=candidates, d_max=100.0))
-        taken = [_seconds(network, critic, retry, attempt) for _ in range(repeats)]
+        taken = [adapted_in(network, critic, retry, attempt) for _ in range(repeats)]
         stages = {k: round(float(np.median([s[k] for _, s in taken])), 3) for k in taken[0][1]}
         seconds = round(float(np.median([whole for whole, _ in taken])), 3)
         rows.append({"preset": preset, "grows": grows, "to": to, "seconds": seconds, "stages": stages})
     return rows
 
 
-def _seconds(network: Any, critic: Any, retry: RetryConfig, attempt: Attempt) -> tuple[float, dict[str, float]]:
+def adapted_in(network: Any, critic: Any, retry: RetryConfig, attempt: Attempt) -> tuple[float, dict[str, float]]:
     """One adaptation that has seen nothing of the attempt yet."""
     from far_app.learning.runtime import ActingPolicy
     from far_app.methods import Ingredients, method

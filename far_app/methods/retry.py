@@ -112,7 +112,7 @@ class RetryMethod:
             denoiser, pairs = learning.run(progress)
             if denoiser is not None:
                 self._become(denoiser, pairs, outdated)
-                learning.note(version=self.policy.version)
+                learning.note("engine", version=self.policy.version)
         except AdaptationCancelledError:
             learning.note(status="cancelled")
         except FarError as error:
