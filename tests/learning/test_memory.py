@@ -22,13 +22,12 @@ class Counter:
 
     def __init__(self, network) -> None:
         self.pictures = 0
-        inner = network.encoder.camera_features
+        for net in network.encoder.nets.values():
+            for camera in net:
+                camera.register_forward_hook(self.count)
 
-        def counted(camera, frame, images):
-            self.pictures += len(images)
-            return inner(camera, frame, images)
-
-        network.encoder.camera_features = counted
+    def count(self, camera, inputs, output) -> None:
+        self.pictures += len(output)
 
 
 def run(own_eyes: bool):
@@ -37,10 +36,13 @@ def run(own_eyes: bool):
     critic = small_critic(network)
     if own_eyes:
         critic = Critic(dataclasses.replace(critic.shape, own_eyes=True), eyes_of(network)).eval().requires_grad_(False)
+    base = ActingPolicy(network, "base", critic, "arranged", memory=memory)
     counters = [Counter(n) for n in (network, *((critic.eyes,) if critic.eyes is not None else ()))]
 
     def act(net, version, steering=None):
-        return ActingPolicy(net, version, critic, "arranged", steering, memory=memory)
+        if version == "base":
+            return base
+        return ActingPolicy(net, version, critic, "arranged", steering, memory=memory, base=base)
 
     made = method("far", Ingredients(network=network, critic=critic, act=act, config=QUICK, memory=memory))
     return made, counters

@@ -91,17 +91,20 @@ def take(
 def check(
     engine: Engine, reference: ReferenceEngine, tolerance: float, batch: int = 1, denoiser_only: bool = False
 ) -> None:
-    """Compare with the reference on noise in place of pictures, one plan and one batch of `batch`. EngineError where
-    the weights are of another version or a result is further off than the tolerance."""
+    """Compare with the reference on noise in place of pictures, one plan and one batch of `batch`; with `denoiser_only`
+    on noise in place of features, for the encoder has not changed. EngineError where the weights are of another version
+    or a result is further off than the tolerance."""
     if engine.version != reference.version:
         raise EngineError(f"it holds the weights of version {engine.version}, not of {reference.version}")
     for size in sorted({1, batch}):
         histories, noise = probe(reference.network, size)
-        expected, chunks = reference.plan(histories, noise)
         if denoiser_only:
-            features, found = expected, engine.sample(expected, noise)
-        else:
-            features, found = engine.plan(histories, noise)
+            features = torch.randn(size, reference.network.feature_dim, generator=torch.Generator().manual_seed(0))
+            features = features.to(noise.device)
+            _compare("chunk", engine.sample(features, noise), reference.sample(features, noise), tolerance)
+            continue
+        expected, chunks = reference.plan(histories, noise)
+        features, found = engine.plan(histories, noise)
         _compare("features", features, expected, tolerance * max(1.0, float(expected.abs().max())))
         _compare("chunk", found, chunks, tolerance)
 
