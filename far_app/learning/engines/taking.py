@@ -40,18 +40,19 @@ class Taken:
 
 
 def order_of(name: str, network: DiffusionPolicy) -> Choice:
-    """What a name asks for: itself, or for "auto" every engine that may run this network by itself, in the order of
-    ENGINES. ConfigError where it is unknown or cannot run the network here."""
+    """What a name asks for: itself first, and for "auto" every engine that may run this network by itself, in the order
+    of ENGINES; the latter also follow a name, should it be refused. ConfigError where it is unknown or cannot run the
+    network here."""
     from far_app.learning.engines import ENGINES
 
+    usable = tuple(e.name for e in ENGINES.values() if e.automatic and not e.unusable(network))
     if name == "auto":
-        usable = tuple(e.name for e in ENGINES.values() if e.automatic and not e.unusable(network))
         return Choice(order=usable, why="the first that runs this policy here")
     if name not in ENGINES:
         raise ConfigError(f"unknown engine '{name}'; choose one of: auto, {', '.join(ENGINES)}")
     if why := ENGINES[name].unusable(network):
         raise ConfigError(f"engine {name} was asked for, but {why}; leave --engine out")
-    return Choice(order=(name,), why="asked for")
+    return Choice(order=tuple(dict.fromkeys((name, *usable))), why="asked for")
 
 
 def take(
