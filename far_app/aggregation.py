@@ -34,6 +34,13 @@ class Plan:
         predictions = [c.actions[tick - k] for k, c in self._chunks.items() if k <= tick]
         return np.mean(predictions, axis=0) if predictions else None
 
+    def newest(self) -> Plan:
+        """The newest chunk alone."""
+        plan = Plan(self.horizon)
+        if self._chunks:
+            plan.add(self._chunks[self.newest_tick])
+        return plan
+
     def spread(self, tick: int) -> float:
         """How far the chunks disagree on tick t: root mean square distance of their arm actions from the mean; NaN with
         fewer than two."""

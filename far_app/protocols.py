@@ -227,6 +227,44 @@ class KeepsWeights(Protocol):
 
 
 @runtime_checkable
+class ChangesWeights(Protocol):
+    """A method that can be told which version to act with."""
+
+    @property
+    def policy(self) -> Policy: ...
+
+    def use(self, weights: AdaptedWeights | None, version: str, *, base: bool) -> None:
+        """From now on act with these weights, None for the policy it was made with; `base`: trials begin with them.
+        Between attempts only; may take as long as making a policy does. Raises FarError where they do not fit."""
+        ...
+
+
+class Person(Protocol):
+    """Somebody who may take the arm from the policy during an attempt."""
+
+    @property
+    def steers(self) -> bool:
+        """The person has the arm."""
+        ...
+
+    def action(self, observation: Observation) -> Float[np.ndarray, "A"] | None:
+        """The coming tick's action, like a policy's; None while the policy acts. Asked once a tick; never waits."""
+        ...
+
+
+class Nobody:
+    """far_app.protocols.Person where none is there."""
+
+    steers = False
+
+    def action(self, observation: Observation) -> None:
+        return None
+
+
+NOBODY = Nobody()
+
+
+@runtime_checkable
 class SuccessDetector(Protocol):
     """Says when an attempt is over."""
 

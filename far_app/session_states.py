@@ -24,6 +24,8 @@ class State(StrEnum):
     """Going to the start pose before a first attempt."""
     RUNNING = "running"
     """An attempt is under way."""
+    TAKEN_OVER = "taken_over"
+    """An attempt is under way and a person moves the arm."""
     PAUSED = "paused"
     """An attempt is held by the operator."""
     ADAPTING = "adapting"
@@ -49,6 +51,10 @@ class Intent(StrEnum):
     MARK_SUCCESS = "mark_success"
     MARK_FAILURE = "mark_failure"
     SKIP_TRIAL = "skip_trial"
+    TAKE_OVER = "take_over"
+    """A person moves the arm from here on."""
+    HAND_BACK = "hand_back"
+    """The policy acts again."""
     SCENE_READY = "scene_ready"
     QUIT = "quit"
 
@@ -109,6 +115,17 @@ def _table() -> dict[tuple[State, Event], State]:
         (s.PAUSED, i.SKIP_TRIAL): s.RUNNING,
         (s.HOMING, i.SKIP_TRIAL): s.TRIAL_DONE,
         (s.ADAPTING, i.SKIP_TRIAL): s.TRIAL_DONE,
+        # a person has the arm: the attempt goes on, and ends as it would under the policy
+        (s.RUNNING, i.TAKE_OVER): s.TAKEN_OVER,
+        (s.PAUSED, i.TAKE_OVER): s.TAKEN_OVER,  # a paused attempt's; refused on the way home (session/operator.py)
+        (s.TAKEN_OVER, i.HAND_BACK): s.RUNNING,
+        (s.TAKEN_OVER, i.PAUSE): s.PAUSED,  # Resume then gives the arm to the policy
+        (s.TAKEN_OVER, i.MARK_SUCCESS): s.RUNNING,
+        (s.TAKEN_OVER, i.MARK_FAILURE): s.RUNNING,
+        (s.TAKEN_OVER, i.SKIP_TRIAL): s.RUNNING,
+        (s.TAKEN_OVER, h.SUCCEEDED): s.TRIAL_DONE,
+        (s.TAKEN_OVER, h.FAILED_RETRY): s.ADAPTING,
+        (s.TAKEN_OVER, h.FAILED_LAST): s.TRIAL_DONE,
         # pause, and leaving a pause, a stop or a fault: READY for an instant, then what was interrupted goes on
         (s.RUNNING, i.PAUSE): s.PAUSED,
         (s.HOMING, i.PAUSE): s.PAUSED,
@@ -149,6 +166,8 @@ _WHY: dict[Intent, str] = {
     Intent.MARK_SUCCESS: "no attempt is under way or just failed",
     Intent.MARK_FAILURE: "no attempt is under way",
     Intent.SKIP_TRIAL: "no trial is under way that could be skipped",
+    Intent.TAKE_OVER: "only an attempt under way can be taken over",
+    Intent.HAND_BACK: "nobody has taken over",
     Intent.SCENE_READY: "the app does not wait for a scene",
     Intent.QUIT: "the session has ended",
 }

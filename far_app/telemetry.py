@@ -8,7 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from far_app.lineage import Versions
+from far_app.marks import Judged
 from far_app.session_states import Intent, State
+from far_app.take_over import Steering
 from far_app.types import AdaptationStep, Pose, RobotStatus
 from far_app.wire import register
 
@@ -49,7 +52,7 @@ class TrialRow:
     seconds: float
     note: str = ""
     counted: bool = True
-    """False for a trial that began at reduced speed: not for statistics."""
+    """False for a trial that began at reduced speed, or in which a person helped: not for statistics."""
 
 
 @register
@@ -116,12 +119,17 @@ class Telemetry:
     loop: LoopHealth = field(default_factory=LoopHealth)
     history: tuple[TrialRow, ...] = ()
     """Newest last, at most 200."""
+    attempts: tuple[Judged, ...] = ()
+    """Those that ended, newest last, at most 300."""
+    versions: Versions = field(default_factory=Versions)
     log: tuple[LogLine, ...] = ()
     """Newest last, at most 50."""
     refusal: str = ""
     """Why the last intent was refused."""
     allowed: tuple[Intent, ...] = ()
     """Intents that apply now."""
+    steering: Steering = field(default_factory=Steering)
+    """A person's part in the attempt."""
 
 
 @register
@@ -137,9 +145,10 @@ class OperatorIntent:
 @register
 @dataclass(frozen=True, kw_only=True)
 class PagePresence:
-    """From the page to the app, several times a second: somebody has it open, or nobody has."""
+    """From the page to the app, several times a second: somebody who may act has it open, or nobody has."""
 
     clients: int
+    """1 while the viewer who holds control answers, else 0."""
 
 
 @register

@@ -13,6 +13,7 @@ evaluation, a test) can pace, pause or abort it anywhere; it holds no clock, no 
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
@@ -24,7 +25,19 @@ from far_app.aggregation import Plan
 from far_app.alarm import Alarm, NoAlarm
 from far_app.config import TaskConfig
 from far_app.motion import ActionScale, TargetIntegrator
-from far_app.protocols import Heartbeat, Hold, Home, Method, Planner, PlanRequest, Reset, Robot, SuccessDetector
+from far_app.protocols import (
+    NOBODY,
+    Heartbeat,
+    Hold,
+    Home,
+    Method,
+    Person,
+    Planner,
+    PlanRequest,
+    Reset,
+    Robot,
+    SuccessDetector,
+)
 from far_app.types import (
     ACTION_DIM,
     ARM_DIMS,
@@ -40,6 +53,10 @@ from far_app.types import (
 )
 
 NO_ALARM = NoAlarm()
+FADE_IN = 10
+"""Ticks over which the policy's motion comes back after a person handed the arm back."""
+HELP_LIMIT = 3600
+"""Ticks for which a person may have the arm in one attempt (two minutes at 30 Hz); then it ends as at its horizon."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,6 +127,7 @@ def trial(
     start_adaptation: StartAdaptation,
     stretch: int = 1,
     alarm: Alarm = NO_ALARM,
+    person: Person = NOBODY,
 ) -> TrialEvents:
     """Algorithm 1. Returns the trial's attempts and adaptations; afterwards the method holds the base policy again."""
     attempts: list[Attempt] = []
@@ -121,7 +139,7 @@ def trial(
         yield AttemptStarted(attempt_index=i, policy_version=method.policy.version)
         slowly = stretch if i == 1 else 1
         attempt = yield from execute(
-            robot, planner, method, detector, task, scale, scene_seed, i, slowly, alarm
+            robot, planner, method, detector, task, scale, scene_seed, i, slowly, alarm, person
         )  # fmt: skip
         attempts.append(attempt)
         last = attempt.outcome.success or i == task.max_attempts
@@ -147,10 +165,13 @@ def execute(
     index: int,
     stretch: int = 1,
     alarm: Alarm = NO_ALARM,
+    person: Person = NOBODY,
 ) -> Generator[Event, float | ActionChunk | None, Attempt]:
     """One attempt. A tick: observe → judge → chunk → aggregate → perturb → target.
 
-    Stretched, each of the policy's ticks takes so many of the robot's: the same way and the same horizon, slower."""
+    Stretched, each of the policy's ticks takes so many of the robot's: the same way and the same horizon, slower. While
+    a person steers, theirs is the action and the horizon stands still; afterwards the policy plans anew and its motion
+    fades in."""
     spec = method.policy.spec
     shares = np.array((stretch,) * ARM_DIMS + (1,))  # the gripper is told the whole of its action in every part
     plan = Plan(horizon=spec.horizon)
@@ -158,12 +179,13 @@ def execute(
     history: deque[Observation] = deque(maxlen=spec.n_obs)
     steps: list[Step] = []
     step: Step | None = None
+    helped, since = 0, FADE_IN  # ticks a person acted, ticks the policy has had the arm again
     detector.begin()
     alarm.begin()
     planner.begin(method.policy)
     integrator = TargetIntegrator(scale, robot.observe().eef)
 
-    for t in range(task.horizon + 1):
+    for t in itertools.count():
         deadline = yield Tick(phase="attempt", attempt_index=index, step=steps[-1] if steps else None)
         assert isinstance(deadline, float), "a Tick is answered with its deadline"
         observation = robot.observe()
@@ -172,8 +194,16 @@ def execute(
         if isinstance(deadline, AfterHold):
             plan, integrator = Plan(horizon=spec.horizon), TargetIntegrator(scale, observation.eef)
             history.clear()
-        outcome = detector.judge(observation) or fault(observation) or alarm.judge(plan, t)
-        if outcome is not None or t == task.horizon:
+        outcome = detector.judge(observation) or fault(observation)
+        if outcome is None and not person.steers:
+            outcome = alarm.judge(plan, t)
+            if outcome is None and t - helped == task.horizon and detector.patience > 0:
+                outcome = yield from wait_for_word(robot, detector, index, person)
+                if person.steers:  # the arm was held: on from where it stands
+                    observation = robot.observe()
+                    integrator = TargetIntegrator(scale, observation.eef)
+        over = helped == HELP_LIMIT or (t - helped == task.horizon and not person.steers)
+        if outcome is not None or over:
             break
 
         history.extend([observation] * (spec.n_obs if not history else 1))
@@ -181,9 +211,20 @@ def execute(
             plan.add(chunk)
             if chunk.tick < len(steps):  # V(s_k) of an earlier tick, computed in time for the record
                 steps[chunk.tick] = replace(steps[chunk.tick], value=chunk.value)
-        action = plan.action(t)  # â_t = g(chunks)
-        delta = perturbation(t) if action is not None else np.zeros(ACTION_DIM)  # δ_t
+        asked = person.action(observation)
+        if (
+            asked is None and step is not None and step.intervention
+        ):  # handed back: plans for where the arm was are void
+            plan, since = plan.newest(), 0
+            alarm.begin()
+        action = asked if asked is not None else plan.action(t)  # â_t = g(chunks)
+        delta = perturbation(t) if asked is None and action is not None else np.zeros(ACTION_DIM)  # δ_t
         commanded = np.clip(action + delta, -1.0, 1.0) if action is not None else hold_still(steps)
+        if asked is not None:
+            helped += 1
+        elif since < FADE_IN:
+            since += 1
+            commanded = commanded * np.array((since / FADE_IN,) * ARM_DIMS + (1.0,))
         part, here = commanded / shares, observation
         for _ in range(stretch - 1):
             robot.send(integrator.target(part, here.eef, deadline))
@@ -202,11 +243,9 @@ def execute(
             action=action if action is not None else commanded, perturbation=delta, commanded=commanded,
             sent=np.full(ACTION_DIM, np.nan), chunk_tick=plan.newest_tick, starved=action is None,
             policy_version=method.policy.version, value=plan.value(t), reward=observation.reward,
-            success=observation.success,
+            success=observation.success, intervention=asked is not None,
         )  # fmt: skip
 
-    if outcome is None and detector.patience > 0:
-        outcome = yield from wait_for_word(robot, detector, index)
     return Attempt(
         index=index, scene_seed=scene_seed, steps=tuple(steps), final=observation,
         outcome=outcome or Outcome(success=False, judged_by=Judge.HORIZON), policy_version=method.policy.version,
@@ -214,14 +253,14 @@ def execute(
 
 
 def wait_for_word(
-    robot: Robot, detector: SuccessDetector, index: int
+    robot: Robot, detector: SuccessDetector, index: int, person: Person
 ) -> Generator[Event, float | ActionChunk | None, Outcome | None]:
     """The horizon is over and nobody has judged: hold the arm and ask the operator, for so long as the detector says.
-    None when no word came."""
+    None when no word came, or a person took the arm instead."""
     robot.request(Hold(reason="waiting for the operator: success or failure?"))
     began = now = yield Tick(phase="judging", attempt_index=index)
     assert isinstance(began, float) and isinstance(now, float), "a Tick is answered with its deadline"
-    while now < began + detector.patience:
+    while now < began + detector.patience and not person.steers:
         observation = robot.observe()
         outcome = detector.judge(observation) or fault(observation)
         if outcome is not None:

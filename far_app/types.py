@@ -13,6 +13,8 @@ from enum import StrEnum
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from far_app.device_input import DeviceInput
+
 ACTION_DIM = 7
 """Three translations, three rotations (rotation vector, base frame), the gripper (−1 opens, +1 closes)."""
 ARM_DIMS = 6
@@ -115,6 +117,8 @@ class Observation:
     """The twin's own check of the task at this moment; None on hardware."""
     reward: float = 0.0
     """The twin's shaped reward, in [0, 1]; 0 on hardware."""
+    device: DeviceInput | None = None
+    """An input device at the arm; None without one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,7 +152,7 @@ class Step:
     perturbation: Float[np.ndarray, "A"]
     """δ_t; zeros on a first attempt."""
     commanded: Float[np.ndarray, "A"]
-    """â_t + δ_t, clipped to [−1, 1]."""
+    """â_t + δ_t, clipped to [−1, 1]; its motion fades in over the first ticks after a person handed back."""
     sent: Float[np.ndarray, "A"]
     """ã_t: the action that equals what the safety filter let pass; NaN until acknowledged."""
     chunk_tick: int
@@ -162,6 +166,8 @@ class Step:
     success: bool | None
     lateness: float = float("nan")
     """Seconds from the deadline to the target's acceptance in the hw server."""
+    intervention: bool = False
+    """A person moved the arm: `action` is theirs."""
 
 
 class Judge(StrEnum):

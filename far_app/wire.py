@@ -15,6 +15,7 @@ import msgpack
 import numpy as np
 
 from far_app import protocols, types
+from far_app.device_input import DeviceInput
 from far_app.errors import FarError
 
 WIRE_VERSION = 1
@@ -44,6 +45,7 @@ for _cls in (
     types.Pose, types.RobotStatus, types.Target, types.Ack, types.Observation, types.ActionChunk, types.Outcome,
     types.RobotMode, types.Judge, types.AdaptationStep, types.Adaptation, types.Contrast, types.FlagCorrection,
     protocols.Reset, protocols.Home, protocols.Hold, protocols.Resume, protocols.Heartbeat, protocols.Frame,
+    DeviceInput,
 ):  # fmt: skip
     register(_cls)
 

@@ -10,9 +10,11 @@ import math
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 
 import zmq
 
+from far_app.device_input import DeviceInput
 from far_app.scheduling import MESSAGE_PRIORITY, real_time
 from far_app.wire import pack
 from hw.camera_thread import Pictures
@@ -23,7 +25,11 @@ from hw.servo_thread import ServoThread
 class PublisherThread:
     """Publishes until closed."""
 
-    def __init__(self, servo: ServoThread, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, rate: float) -> None:
+    def __init__(
+        self, servo: ServoThread, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, rate: float,
+        device: Callable[[], DeviceInput | None] = lambda: None,
+    ) -> None:  # fmt: skip
+        self._device = device
         self._servo, self._context, self._endpoint = servo, context, endpoint
         self._longest = 1.25 / rate
         """Seconds between two observations, with or without news."""
@@ -74,7 +80,9 @@ class PublisherThread:
                 self.seq += 1
                 status, acks = controller.status(), controller.take_acks()
             newest, pictures = self._servo.newest, self._pictures
-            message = observation(self.seq, pictures.stamp, newest.measured, status, acks, pictures.images)
+            message = observation(
+                self.seq, pictures.stamp, newest.measured, status, acks, pictures.images, self._device()
+            )
             socket.send(pack(message), zmq.NOBLOCK)
             if pictures.seq != shown:
                 shown = pictures.seq

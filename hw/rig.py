@@ -17,6 +17,7 @@ from far_app.config import Arm, TaskConfig, from_table
 from far_app.errors import ConfigError
 from far_app.motion import ActionScale
 from hw.camera_config import CameraConfig, cameras_from
+from hw.input_device.settings import InputDeviceSettings
 from hw.xarm7.settings import XArmSettings
 
 RIGS = Path(__file__).parent / "rigs"
@@ -101,6 +102,8 @@ class RigConfig:
     cameras: Mapping[str, CameraConfig] | None = None
     """The file's [camera.NAME] tables; empty where it says cameras = [], none on purpose. None: the task's own views,
     which the twin draws."""
+    input_device: InputDeviceSettings = field(default_factory=InputDeviceSettings)
+    """What a person may move the arm with, at the robot PC."""
     xarm: XArmSettings = field(default_factory=XArmSettings)
     """A real xArm7's controller, tool and gripper."""
 

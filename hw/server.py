@@ -3,6 +3,7 @@ the app, `far hw-server --bind tcp://ADDRESS:PORT` on a machine of its own.
 
     servo thread     plant, controller, safety filter, watchdog; nothing else touches the arm
     camera thread    draws; View to the page
+    input device     reads a SpaceMouse or gamepad, where the rig has one
     publisher        Observation to the app
     command thread   targets, heartbeats, requests, geometry, what this station is and its clock
     stop thread      STOP, on its own context
@@ -44,6 +45,7 @@ from hw.camera_thread import CameraThread
 from hw.command_thread import CommandThread
 from hw.controller import ArmController
 from hw.hardware_view import HardwareView
+from hw.input_device.reader import InputReader
 from hw.picture_timing import PictureTiming
 from hw.plant import Plant, PlantView
 from hw.publisher_thread import PublisherThread
@@ -87,7 +89,11 @@ class Server:
         make_view = (lambda: HardwareView(make_bodies(), cameras)) if cameras else make_bodies
         controller = ArmController(rig, task, self.plant.servo_hz, self.plant.measure())
         self.servo = ServoThread(self.plant, controller, camera_rate=task.rate)
-        self.publisher = PublisherThread(self.servo, self.context, endpoints.observations, task.rate)
+        self.device = InputReader(rig.input_device) if rig.input_device.kind else None
+        self.publisher = PublisherThread(
+            self.servo, self.context, endpoints.observations, task.rate,
+            self.device.newest if self.device is not None else lambda: None,
+        )  # fmt: skip
         self.cameras = CameraThread(
             make_view, rig, task, self.servo, self.context, endpoints.view, self.publisher.pictures, self._lost
         )
@@ -108,6 +114,8 @@ class Server:
         self.cameras.start()  # first: setting up GL holds the interpreter for a second or two
         self.servo.start()
         self.publisher.start()
+        if self.device is not None:
+            self.device.start()
         self.commands.start()
 
     def close(self, reason: str) -> None:
@@ -116,6 +124,8 @@ class Server:
             controller.request(Hold(reason=reason), time.monotonic())
         if self.servo.alive:
             time.sleep(BRAKING)
+        if self.device is not None:
+            self.device.close()
         for part in (self.commands, self.cameras, self.publisher, self.stop, self.servo, self.plant):
             part.close()
         if self.gate is not None:

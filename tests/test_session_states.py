@@ -79,7 +79,8 @@ def test_the_happy_path_needs_no_intent():
 
 
 def test_motion_never_follows_a_stop_without_resume():
-    moving = {State.HOMING, State.RUNNING, State.ADAPTING}
+    moving = {State.HOMING, State.RUNNING, State.TAKEN_OVER, State.ADAPTING}
+    leads_on = (Intent.MARK_SUCCESS, Intent.MARK_FAILURE, Intent.SKIP_TRIAL, Intent.TAKE_OVER)
     for (origin, event), target in TABLE.items():
         if origin in (State.STOPPED, State.FAULT, State.PAUSED) and target in moving:
-            assert origin is State.PAUSED and event in (Intent.MARK_SUCCESS, Intent.MARK_FAILURE, Intent.SKIP_TRIAL)
+            assert origin is State.PAUSED and event in leads_on

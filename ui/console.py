@@ -20,11 +20,17 @@ from far_app.telemetry import Telemetry, View
 from far_app.types import RobotMode
 from ui import html
 from ui.keys import Page, add_hotkey, hint, key_of
+from ui.lineage import Lineage
+from ui.marks import Marks
 from ui.page_server import Presses
+from ui.panels import BLUE, Panels
 from ui.plots import Plots
+from ui.presence import Presence
 from ui.scene3d import BRAND, FLAGGED, Scene3D
 from ui.stop import StopLine
+from ui.take_over import TakeOver
 from ui.view_model import Freshness, adaptation, arm_word, banner, control, loop_gauges, summary
+from ui.viewers import Live, Viewers
 
 PLACES = ("front", "wrist")
 """On the page, left to right, as style.css names them, whatever the views are called; more of them: the rerun page."""
@@ -59,7 +65,9 @@ _BUTTONS = (
     _control(Intent.MARK_FAILURE, "Mark failure", _AMBER, 1, 1),
     _control(Intent.SKIP_TRIAL, "Skip trial", _QUIET, 0, 2),
     _control(Intent.SCENE_READY, "Scene ready", BRAND, 1, 2),
-    _Button(intent=Intent.QUIT, label="End session", color=_QUIET, box=(0.7, 26.4, 22.3, 3.3)),
+    _Button(intent=Intent.TAKE_OVER, label="Take over", color=BLUE, box=(0.7, 26.4, 10.85, 3.3)),
+    _Button(intent=Intent.HAND_BACK, label="Hand back", color=_AMBER, box=(0.7, 26.4, 10.85, 3.3)),
+    _Button(intent=Intent.QUIT, label="End session", color=_QUIET, box=(12.15, 26.4, 10.85, 3.3)),
 )
 
 
@@ -70,23 +78,26 @@ class Console:
         self,
         server: viser.ViserServer,
         stop_line: StopLine,
+        presence: Presence,
         latest: Callable[[], tuple[Telemetry | None, Freshness]],
         *,
         scene3d: bool,
         cameras: Sequence[str] = PLACES,
     ) -> None:
         self._cameras = cameras
-        self.pressed: queue.SimpleQueue[Intent] = queue.SimpleQueue()
-        """Intents that passed the guard, for the caller to send."""
+        self.pressed: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        """Intents and other words that passed the guard, for the caller to send."""
         self.refusal = ""
         """Why the page itself refused the last press."""
         self._gui, self._stop, self._latest = server.gui, stop_line, latest
-        self._presses = Presses(server)
+        self._server, self._presence = server, presence
+        self._presses = Presses(server, presence)
+        self._presses.refused = self.refuse
         self._refused_at = self._ending_until = 0.0
         self._beats = 0
         self._images: dict[str, viser.GuiImageHandle] = {}
         self._pictures: dict[str, bytes] = {}
-        self._controls: dict[Intent, tuple[_Button, viser.GuiButtonHandle, Any]] = {}
+        self._controls: dict[Intent, tuple[_Button, viser.GuiButtonHandle, viser.CommandHandle | None]] = {}
         server.gui.configure_theme(dark_mode=True, brand_color=BRAND, show_logo=False, show_share_button=False)
         server.gui.set_panel_label("FAR")
         self.scene = Scene3D(server) if scene3d else None
@@ -103,8 +114,8 @@ class Console:
         hotkey = self._hotkey(Intent.STOP, "STOP the arm")
         assert hotkey is not None
 
-        self._presses.on(stop, lambda: self._press_stop("page: button"))
-        self._presses.on(hotkey, lambda: self._press_stop("page: space key"))
+        self._presses.on(stop, lambda: self._press_stop("page: button"), everyone=True)
+        self._presses.on(hotkey, lambda: self._press_stop("page: space key"), everyone=True)
         places = [_place(stop, (0.7, 0.7, 22.3, 8.6)), _big(stop)]
         places += [self._add_control(button) for button in _BUTTONS]
         self._adapt = gui.add_html(html.adaptation(adaptation(None)))
@@ -112,8 +123,12 @@ class Console:
         self._events = gui.add_html(html.events((), 0.0))
         self._add_cameras()
         self.plots = Plots(gui)
+        self._panels = self._add_panels()
         self._foot = gui.add_html(html.foot((), "", None, ""))
-        gui.add_html(f"<style>{_STYLE}\n@media (min-width: 768px) {{ {' '.join(places)} }}</style>")
+        self._viewers = Viewers(self._server, self._presses, self._presence, Page.CONSOLE)
+        gui.add_html(
+            f"<style>{_STYLE}\n@media (min-width: 768px) {{ {' '.join(places)} {self._panels.style} }}</style>"
+        )
 
     def _add_control(self, button: _Button) -> str:
         handle = self._gui.add_button(button.label, disabled=True, color=button.color)
@@ -129,6 +144,14 @@ class Console:
         key = key_of(Page.CONSOLE, action)
         return add_hotkey(self._gui, key, label, disabled=disabled) if key is not None else None
 
+    def _add_panels(self) -> Panels:
+        marks = Marks()
+        panels = Panels(
+            self._gui, self._presses, self._latest, self.pressed.put, self.refuse, (TakeOver(), marks, Lineage())
+        )  # fmt: skip
+        marks.add_field(self._gui, self._presses, panels)
+        return panels
+
     def _add_cameras(self) -> None:
         for camera, place in zip(self._cameras, PLACES, strict=False):
             self._gui.add_html(html.caption(camera, "", f"mark-{place}"))
@@ -143,13 +166,13 @@ class Console:
         telemetry, fresh = self._latest()
         asked = control(intent, telemetry, fresh)
         if by_key and intent is Intent.RESUME and asked.enabled and telemetry and telemetry.state is not State.PAUSED:
-            self.refuse(intent, "after a stop or a fault, click it")
+            self.refuse(intent.value, "after a stop or a fault, click it")
         elif asked.enabled and intent is Intent.QUIT and time.monotonic() > self._ending_until:
             self._ending_until = time.monotonic() + CONFIRM
         elif asked.enabled:
             self.pressed.put(intent)
         else:
-            self.refuse(intent, asked.reason)
+            self.refuse(intent.value, asked.reason)
 
     def _hint(self, button: _Button, telemetry: Telemetry | None) -> str:
         if button.intent is Intent.RESUME and telemetry is not None and telemetry.state is not State.PAUSED:
@@ -158,9 +181,9 @@ class Console:
             return "click again to end it"
         return hint(Page.CONSOLE, button.intent)
 
-    def refuse(self, intent: Intent, reason: str) -> None:
+    def refuse(self, what: str, reason: str) -> None:
         """Say on the page that a press had no effect, and why."""
-        self.refusal = f"{intent.value.replace('_', ' ')} refused: {reason}"
+        self.refusal = f"{what.replace('_', ' ').lower()} refused: {reason}"
         self._refused_at = time.monotonic()
 
     def beat(self, fresh: Freshness) -> None:
@@ -178,16 +201,13 @@ class Console:
     ) -> None:
         """Words, buttons, tables; viser sends only what changed. `viewer` is where rerun shows the session, `why` its
         attempt view."""
+        taken_over = telemetry is not None and telemetry.state is State.TAKEN_OVER
         status = view.status if view is not None and not fresh.hw_silent else None
-        self._head.content = html.head(banner(telemetry, fresh), arm_word(status))
+        self._head.content = html.head(banner(telemetry, fresh), arm_word(status, taken_over))
         latched = status is not None and status.mode is RobotMode.LATCHED
         self._stop_note.content = html.stop_note(self._stop.result, latched, status.reason if status else "")
-        for intent, (button, handle, command) in self._controls.items():
-            now = control(intent, telemetry, fresh)
-            line = self._hint(button, telemetry) if now.enabled else now.reason
-            handle.disabled, handle.label = not now.enabled, f"{button.label}\n{line}"
-            if command is not None:
-                command.disabled = not now.enabled
+        self._show_controls(telemetry, fresh, taken_over)
+        self._panels.show(telemetry)
         self._adapt.content = html.adaptation(adaptation(telemetry))
         refusal = self.refusal if time.monotonic() - self._refused_at < 6 else ""
         gauges, session = loop_gauges(telemetry), telemetry.session if telemetry else ""
@@ -196,6 +216,16 @@ class Console:
             self._events.content = html.events(telemetry.log, telemetry.stamp)
             refusal = refusal or telemetry.refusal
         self._foot.content = html.foot(gauges, refusal, viewer, session, why)
+
+    def _show_controls(self, telemetry: Telemetry | None, fresh: Freshness, taken_over: bool) -> None:
+        live: list[Live] = []
+        for intent, (button, handle, hotkey) in self._controls.items():
+            now = control(intent, telemetry, fresh)
+            line = self._hint(button, telemetry) if now.enabled else now.reason
+            live.append(Live(button=handle, hotkey=hotkey, enabled=now.enabled, label=button.label, line=line))
+        for intent, there in ((Intent.TAKE_OVER, not taken_over), (Intent.HAND_BACK, taken_over)):
+            self._controls[intent][1].visible = there
+        self._viewers.show([*live, *self._panels.live(telemetry, fresh)])
 
     def pictures(self, view: View) -> None:
         """The cameras' JPEGs as they came: no decoding and no encoding on the way to the browser."""

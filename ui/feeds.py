@@ -128,11 +128,13 @@ class Feeds:
         self._intents.setsockopt(zmq.IMMEDIATE, 1)
         self._intents.connect(endpoints.intents)
 
-    def send(self, intent: Intent, operator: str) -> bool:
-        """Hand an intent to the app; False when nobody takes it (then it is dropped, never sent late). Waits TAKE at
-        most: this socket finds an app that has just begun to listen a moment after the app's own words arrive here."""
+    def send(self, said: Any, operator: str) -> bool:
+        """Hand an intent, or another registered word, to the app; False when nobody takes it (then it is dropped, never
+        sent late). Waits TAKE at most: this socket finds an app that has just begun to listen a moment after the app's
+        own words arrive here."""
         try:
-            message = OperatorIntent(intent=intent, operator=operator, stamp=time.monotonic())
+            is_intent = isinstance(said, Intent)
+            message = OperatorIntent(intent=said, operator=operator, stamp=time.monotonic()) if is_intent else said
             self._intents.poll(TAKE, zmq.POLLOUT)
             self._intents.send(pack(message), zmq.NOBLOCK)
         except zmq.Again:

@@ -8,11 +8,14 @@ from html import escape
 import numpy as np
 
 from far_app.telemetry import LogLine, Telemetry, TrialRow
+from ui.keys import Page, keys_of
 from ui.stop import StopResult
 from ui.view_model import AdaptationCard, Banner, Freshness, Gauge, Tone
 
 HISTORY_ROWS = 40
 LOG_LINES = 30
+ONE_COLUMN = 13
+"""Keys that fit below each other; more of them stand in two columns."""
 
 
 def head(banner: Banner, arm: tuple[str, Tone]) -> str:
@@ -105,15 +108,24 @@ def foot(gauges: tuple[Gauge, ...], refusal: str, viewer: str | None, session: s
         f'<span class="tone-{g.tone}"><i>{escape(g.label)}</i><b>{escape(g.value)}</b></span>' for g in gauges
     )
     link = (
-        f'<a href="{escape(viewer)}" target="_blank" rel="noreferrer">rerun viewer ↗</a>'
+        '<a href="/go/rerun" target="_blank" rel="noreferrer">rerun viewer ↗</a>'
         if viewer
         else '<a class="off">rerun off</a>'
     )
     if why:
-        link = f'<a href="{escape(why)}" target="_blank" rel="noreferrer">why did it fail ↗</a>' + link
+        link = '<a href="/go/why" target="_blank" rel="noreferrer">why did it fail ↗</a>' + link
     said = f'<span class="far-refusal">{escape(refusal)}</span>' if refusal else ""
-    items += said + f'<span class="far-session">{escape(session)}</span>' + link
+    items = f'{said}<div class="far-gauges">{items}</div><span class="far-session">{escape(session)}</span>{link}'
     return f'<div class="far-foot" id="op-loop">{items}</div>'
+
+
+def keys(page: Page, shown: bool) -> str:
+    """The list on `?`, from the keys table; not shown it is empty."""
+    rows = "".join(f"<p><kbd>{escape(k.cap)}</kbd><span>{escape(k.does)}</span></p>" for k in keys_of(page))
+    note = "Keys do nothing while a text field has the focus. ? closes this list."
+    many = ' class="many"' if len(keys_of(page)) > ONE_COLUMN else ""
+    body = f"<div><h2>Keys</h2><section{many}>{rows}</section><footer>{note}</footer></div>" if shown else ""
+    return f'<div class="far-keys{" on" if shown else ""}" id="op-keys">{body}</div>'
 
 
 def caption(title: str, note: str = "", mark: str = "") -> str:

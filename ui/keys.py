@@ -12,6 +12,7 @@ from typing import Any
 import viser
 
 from far_app.session_states import Intent
+from far_app.take_over import Move
 from ui.why_state import Press
 
 
@@ -24,6 +25,8 @@ class Page(StrEnum):
 
 HELP = "help"
 """The action that shows and hides the list."""
+UNSURE, EARLIER, LATER, UNDO = "mark_unsure", "mark_earlier", "mark_later", "undo_adaptation"
+"""Actions of the panels of marks and of policy versions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,13 +61,33 @@ def _why(action: str, hotkey: str, does: str, modifier: str | None = None) -> Ke
 
 
 KEYS = (
-    _console(Intent.STOP, "space", "STOP: latch the arm at once, from any page"),
+    _console(Intent.STOP, "space", "STOP: latch the arm at once"),
     _console(Intent.PAUSE, "P", "pause the attempt or the way home; cancels a countdown"),
     _console(Intent.RESUME, "R", "resume after a pause; after a stop or a fault, click it"),
     _console(Intent.MARK_SUCCESS, "S", "mark the attempt a success"),
     _console(Intent.MARK_FAILURE, "F", "mark the attempt a failure"),
     _console(Intent.SKIP_TRIAL, "K", "skip the trial"),
     _console(Intent.SCENE_READY, "N", "the scene is rebuilt and the workspace clear"),
+    _console(Intent.TAKE_OVER, "T", "take over: you move the arm, the policy waits"),
+    _console(Intent.HAND_BACK, "B", "hand back: the policy goes on from where the arm is"),
+    _console(Move.FORWARD, "arrowup", "taken over: 5 mm forward, away from the arm's base"),
+    _console(Move.BACK, "arrowdown", "taken over: 5 mm back"),
+    _console(Move.LEFT, "arrowleft", "taken over: 5 mm left, seen from the base"),
+    _console(Move.RIGHT, "arrowright", "taken over: 5 mm right"),
+    _console(Move.UP, "U", "taken over: 5 mm up"),
+    _console(Move.DOWN, "J", "taken over: 5 mm down"),
+    _console(Move.YAW_PLUS, "Q", "taken over: turn left about the vertical"),
+    _console(Move.YAW_MINUS, "E", "taken over: turn right about the vertical"),
+    _console(Move.ROLL_PLUS, "1", "taken over: tilt about x"),
+    _console(Move.ROLL_MINUS, "2", "taken over: tilt about x, the other way"),
+    _console(Move.PITCH_PLUS, "3", "taken over: tilt about y"),
+    _console(Move.PITCH_MINUS, "4", "taken over: tilt about y, the other way"),
+    _console(Move.OPEN, "O", "taken over: open the hand"),
+    _console(Move.CLOSE, "C", "taken over: close the hand"),
+    _console(UNSURE, "Y", "mark the chosen attempt: unsure how it went"),
+    _console(EARLIER, ",", "marks: the attempt before"),
+    _console(LATER, ".", "marks: the attempt after"),
+    _console(UNDO, "Z", "undo the adaptation: the next attempt starts from the weights before it"),
     _console(HELP, "?", "show or hide this list", "shift"),
     _why(Press.NEXT, "N", "the next flagged chunk"),
     _why(Press.PREVIOUS, "B", "the flagged chunk before"),

@@ -7,6 +7,7 @@ import logging
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 log = logging.getLogger(__name__)
@@ -15,9 +16,12 @@ log = logging.getLogger(__name__)
 class LiveViewer:
     """`python -m ui.rerun_live`; url is None until it serves and again when it is gone."""
 
-    def __init__(self, run_folder: Path, recordings: Path) -> None:
+    def __init__(self, run_folder: Path, recordings: Path, at: Sequence[str]) -> None:
+        """`at`: the page's own --host and --token."""
         command = [sys.executable, "-m", "ui.rerun_live", "--run-folder", str(run_folder)]
-        self._process = subprocess.Popen([*command, "--recordings", str(recordings)], stdout=subprocess.PIPE, text=True)
+        self._process = subprocess.Popen(
+            [*command, "--recordings", str(recordings), *at], stdout=subprocess.PIPE, text=True
+        )
         self._url: str | None = None
         threading.Thread(target=self._listen, name="rerun-live", daemon=True).start()
 

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 from far_app.recording.schema import SESSION_FILE
@@ -15,8 +16,9 @@ from far_app.telemetry import Telemetry
 class LiveWhy:
     """`python -m ui.why`; url is None until it serves and again when it is gone."""
 
-    def __init__(self, run_folder: Path, recordings: Path, operator: str) -> None:
-        self._run_folder, self._recordings, self._operator = run_folder, recordings, operator
+    def __init__(self, run_folder: Path, recordings: Path, operator: str, at: Sequence[str]) -> None:
+        """`at`: the page's own --host and --token."""
+        self._run_folder, self._recordings, self._operator, self._at = run_folder, recordings, operator, at
         self._process: subprocess.Popen[str] | None = None
         self.url: str | None = None
 
@@ -26,7 +28,7 @@ class LiveWhy:
         if self._process is not None or not telemetry.flagged or not (session / SESSION_FILE).exists():
             return
         command = [sys.executable, "-m", "ui.why", "--session", str(session), "--run-folder", str(self._run_folder)]
-        command += ["--port", "0", "--operator", self._operator]
+        command += ["--port", "0", "--operator", self._operator, *self._at]
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         threading.Thread(target=self._listen, args=(self._process,), name="why", daemon=True).start()
 

@@ -22,12 +22,14 @@ from websockets.sync.client import ClientConnection, connect
 class RawClient:
     """Follows the page's widgets by id: their properties as last sent."""
 
-    def __init__(self, url: str, origin: str | None = None) -> None:
+    def __init__(self, url: str, origin: str | None = None, cookie: str = "") -> None:
+        """`cookie`: what a page beyond loopback gave for its token."""
         at = urlsplit(url)
         self._socket: ClientConnection = connect(
             f"ws://{at.netloc}",
             subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
             origin=origin,  # type: ignore[arg-type]
+            additional_headers={"Cookie": cookie} if cookie else {},
             max_size=None,
             compression=None,
         )

@@ -27,9 +27,10 @@ import zmq
 from far_app.endpoints import Endpoints
 from far_app.errors import FarError
 from far_app.recording.reader import read_attempt
-from far_app.recording.replay import LOOPBACK, viewer_url
+from far_app.recording.replay import LOOPBACK
 from far_app.recording.scan import ends_in_order
 from far_app.telemetry import Telemetry
+from ui.access import Access
 from ui.feeds import Latest
 from ui.parent import die_with_parent
 from ui.rerun_views import (
@@ -146,11 +147,11 @@ def serve(options: argparse.Namespace, ended: threading.Event) -> None:
     folder = options.run_folder / "rerun_web"
     folder.mkdir(exist_ok=True)
     take_viewer(folder, program, free_port())
-    viewer = SealedViewer(folder, options.web_port, data)
+    viewer = SealedViewer(folder, Access.at(options.host, options.token), options.web_port, data)
     live, files = LiveLog(recording), ClosedAttempts(options.recordings)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     feed = Latest(context, Endpoints.in_folder(options.run_folder).telemetry, Telemetry)
-    sys.stdout.write(json.dumps({"viewer": viewer_url(viewer.port, data)}) + "\n")
+    sys.stdout.write(json.dumps({"viewer": viewer.url}) + "\n")
     sys.stdout.flush()
     next_look = 0.0
     try:
@@ -186,6 +187,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m ui.rerun_live", description="The session in rerun, live.")
     parser.add_argument("--run-folder", type=Path, required=True, help="folder with the run's sockets")
     parser.add_argument("--recordings", type=Path, default=Path("recordings"), help="folder of the sessions")
+    parser.add_argument("--host", default=LOOPBACK, help="address of the web viewer; any but loopback needs --token")
+    parser.add_argument("--token", type=Path, default=None, help="file of the token, made where it is missing")
     parser.add_argument("--web-port", type=int, default=0, help="port of the web viewer; 0 takes a free one")
     options = parser.parse_args(arguments)
     os.nice(5)

@@ -1,12 +1,15 @@
-"""rerun's web viewer, served by ourselves: loopback only, and sealed so that the browser asks nothing of the outside.
+"""rerun's web viewer, served by ourselves: bound and guarded as the page is, and sealed so that the browser asks
+nothing of the outside.
 
 `rerun --serve-web` can bind loopback, but its page loads fonts, a script and usage counters from the internet. So it is
 started once, its five files are taken from it, and we serve them under a Content-Security-Policy that leaves one place
-to connect to: the data server of this run.
+to connect to: here. The data server knows no token and stays on loopback; what the viewer asks of it is handed on.
 """
 
 from __future__ import annotations
 
+import contextlib
+import http.client
 import http.server
 import re
 import shutil
@@ -18,9 +21,11 @@ import urllib.request
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from far_app.errors import FarError
 from far_app.recording.replay import LOOPBACK, quiet_configuration, viewer_command
+from ui.access import Access
 from ui.parent import killed_with_parent
 
 FILES = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico", "sw.js")
@@ -29,12 +34,15 @@ PATIENCE = 60.0
 _OUTSIDE = re.compile(r"<link\b[^>]*https://[^>]*>|<script\b[^>]*src=\"https://[^>]*>\s*</script>", re.DOTALL)
 
 
-def policy(data_port: int) -> str:
-    """What the viewer's page may load and talk to."""
-    return (
-        "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob:; "
-        f"style-src 'self' 'unsafe-inline'; connect-src 'self' data: blob: http://{LOOPBACK}:{data_port}"
-    )
+POLICY = (
+    "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob:; "
+    "style-src 'self' 'unsafe-inline'; connect-src 'self' data: blob:"
+)
+"""What the viewer's page may load and talk to."""
+ASKED = re.compile(r"/[A-Za-z0-9_.]+/[A-Za-z]+")
+"""Path of a call to the data server: /service/method."""
+LARGEST = 2**20
+"""Bytes of a call at most; the viewer's are a few hundred."""
 
 
 def take_viewer(folder: Path, port: int, data_port: int) -> None:
@@ -72,13 +80,18 @@ def _wait_for(url: str, program: subprocess.Popen[bytes]) -> None:
 
 
 class SealedViewer:
-    """Serves the folder on loopback from a thread until closed."""
+    """Serves the folder from a thread until closed."""
 
-    def __init__(self, folder: Path, port: int, data_port: int) -> None:
-        handler = partial(_Handler, directory=str(folder), policy=policy(data_port))
-        self._server = http.server.ThreadingHTTPServer((LOOPBACK, port), handler)
-        self._server.daemon_threads = True
-        self.port = int(self._server.server_address[1])
+    def __init__(self, folder: Path, access: Access, port: int, data_port: int) -> None:
+        handler = partial(_Handler, directory=str(folder), access=access, data_port=data_port)
+        self._server = _Server((access.address, port), handler, bind_and_activate=False)
+        self._server.socket.close()
+        self._server.socket = access.listen(port)
+        self._server.server_address = self._server.socket.getsockname()[:2]
+        port = int(self._server.server_address[1])
+        base = f"http://{access.name}:{port}"
+        data = quote(f"rerun+{base}/proxy", safe="")
+        self.url = f"{base}/?{f'token={access.token}&' if access.token else ''}url={data}"
         threading.Thread(target=self._server.serve_forever, name="rerun-web", daemon=True).start()
 
     def close(self) -> None:
@@ -86,13 +99,55 @@ class SealedViewer:
         self._server.server_close()
 
 
+class _Server(http.server.ThreadingHTTPServer):
+    daemon_threads = True
+
+
 class _Handler(http.server.SimpleHTTPRequestHandler):
-    def __init__(self, *arguments: Any, directory: str, policy: str) -> None:
-        self._policy = policy
+    def __init__(self, *arguments: Any, directory: str, access: Access, data_port: int) -> None:
+        self._access, self._data_port = access, data_port
         super().__init__(*arguments, directory=directory)
 
+    def parse_request(self) -> bool:
+        """Whoever may not come gets no further."""
+        if not super().parse_request():
+            return False
+        headers = {name.title(): value for name, value in self.headers.items()}
+        said = self._access.answer(self.path, headers, int(self.server.server_address[1]))
+        if said is None:
+            return True
+        status, words, headers = said
+        self.send_response(status)
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(words.encode())
+        return False
+
+    def do_POST(self) -> None:
+        """A call of the viewer to the data server, its answer passed on as it comes."""
+        size = int(self.headers.get("Content-Length") or 0)
+        if not ASKED.fullmatch(self.path) or not 0 <= size <= LARGEST:
+            self.send_error(404)
+            return
+        kept = ("content-type", "accept", "x-grpc-web", "x-user-agent", "grpc-timeout")
+        headers = {
+            name: value for name, value in self.headers.items() if name.lower() in kept or name.startswith("x-rerun")
+        }
+        data = http.client.HTTPConnection(LOOPBACK, self._data_port)
+        with contextlib.closing(data), contextlib.suppress(OSError, http.client.HTTPException):
+            data.request("POST", self.path, self.rfile.read(size), headers)
+            answer = data.getresponse()
+            self.send_response(answer.status)
+            for name, value in answer.getheaders():
+                if name.lower() in ("content-type", "grpc-status", "grpc-message"):
+                    self.send_header(name, value)
+            self.end_headers()
+            while part := answer.read1(65536):
+                self.wfile.write(part)
+
     def end_headers(self) -> None:
-        self.send_header("Content-Security-Policy", self._policy)
+        self.send_header("Content-Security-Policy", POLICY)
         self.send_header("Referrer-Policy", "no-referrer")
         super().end_headers()
 

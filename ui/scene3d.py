@@ -83,7 +83,7 @@ class Scene3D:
     def chunk(self, telemetry: Telemetry) -> None:
         """The path of the newest chunk while it is followed, blue; red when that chunk is flagged."""
         points = np.asarray(telemetry.chunk_path, dtype=np.float32)
-        if len(points) < 2 or telemetry.state is not State.RUNNING:
+        if len(points) < 2 or telemetry.state not in (State.RUNNING, State.TAKEN_OVER):
             if self._path is not None:
                 self._path.visible = False
             return
@@ -100,7 +100,7 @@ class Scene3D:
         attempt = (telemetry.trial, telemetry.attempt)
         if attempt != self._attempt:
             self._attempt, self._trail = attempt, []
-        eef, running = telemetry.eef, telemetry.state is State.RUNNING
+        eef, running = telemetry.eef, telemetry.state in (State.RUNNING, State.TAKEN_OVER)
         if eef is not None and running and (not self._trail or telemetry.tick > self._trail[-1][0]):
             self._trail.append((telemetry.tick, np.array(eef.position, dtype=np.float32)))
             del self._trail[:-TRAIL_LIMIT]

@@ -14,17 +14,23 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from far_app.endpoints import Endpoints
+from far_app.lineage import VersionWish
+from far_app.marks import MarkAttempt
+from far_app.recording.said_lines import now
 from far_app.session_states import Intent
+from far_app.take_over import Nudge
 from far_app.telemetry import Telemetry
+from ui.access import Access
 from ui.console import Console
 from ui.feeds import Feeds
 from ui.live_viewer import LiveViewer
 from ui.live_why import LiveWhy
-from ui.page_server import open_page, page_url
+from ui.page_server import open_page
 from ui.parent import die_with_parent, run_until_told
 from ui.presence import Presence
 from ui.stop import StopLine, hasten
@@ -56,6 +62,8 @@ class Every:
 class PageOptions:
     run_folder: Path
     host: str = "127.0.0.1"
+    token: Path | None = None
+    """File of what a browser must show to open the page; needed on any address but loopback."""
     port: int = 8080
     scene3d: bool = True
     operator: str = "operator"
@@ -73,22 +81,32 @@ class Page:
     def __init__(self, options: PageOptions) -> None:
         self._options = options
         endpoints = Endpoints.in_folder(options.run_folder)
+        access = Access.at(options.host, options.token)
         self._presence = Presence()
-        self._server = open_page(options.host, options.port, self._presence)
-        self.port = self._server.get_port()
+        self._beside: dict[str, LiveViewer | LiveWhy] = {}
+        self._server = open_page(access, options.port, self._presence, self._door)
+        self.url = access.url(self._server.get_port())
         listener = self._server._websock_server._server_thread
         if listener is not None and listener.native_id is not None:
             hasten(listener.native_id)  # the thread that hears STOP
         self._feeds = Feeds(endpoints)
         self._stop_line = StopLine(endpoints)
         self._console = Console(
-            self._server, self._stop_line, self._latest, scene3d=options.scene3d, cameras=options.cameras
-        )
-        self._viewer = LiveViewer(options.run_folder, options.recordings) if options.rerun else None
-        self._why = LiveWhy(options.run_folder, options.recordings, options.operator)
+            self._server, self._stop_line, self._presence, self._latest, scene3d=options.scene3d,
+            cameras=options.cameras,
+        )  # fmt: skip
+        at = ["--host", options.host, *(("--token", str(options.token)) if options.token is not None else ())]
+        self._viewer = LiveViewer(options.run_folder, options.recordings, at) if options.rerun else None
+        self._why = LiveWhy(options.run_folder, options.recordings, options.operator, at)
+        self._beside |= {"why": self._why, **({"rerun": self._viewer} if self._viewer is not None else {})}
         self._plots, self._texts, self._trails, self._beats = Every(1 / 5), Every(1 / 5), Every(1 / 5), Every(1 / 2)
         self._telling = Every(1 / 4)
         self._hw_seq = 0
+
+    def _door(self, name: str) -> str | None:
+        """Where the page's links lead; asked from the first moment on."""
+        beside = self._beside.get(name)
+        return beside.url if beside is not None else None
 
     def _latest(self) -> tuple[Telemetry | None, Freshness]:
         return self._feeds.telemetry.message, self._fresh()
@@ -140,12 +158,14 @@ class Page:
         """Wait for the next tick (monotonic seconds); what is pressed meanwhile goes to the app at once."""
         while True:
             try:
-                intent = self._console.pressed.get(timeout=max(0.0, until - time.monotonic()))
+                said = self._console.pressed.get(timeout=max(0.0, until - time.monotonic()))
             except queue.Empty:
                 return
-            if not self._feeds.send(intent, self._options.operator) and intent is not Intent.STOP:
-                log.warning("nobody takes the intent %s: is the app running?", intent.value)
-                self._console.refuse(intent, "the app did not take it; press again")
+            said = signed(said, self._options.operator)
+            if not self._feeds.send(said, self._options.operator) and said is not Intent.STOP:
+                what = said.value if isinstance(said, Intent) else type(said).__name__
+                log.warning("nobody takes the word %s: is the app running?", what)
+                self._console.refuse(what, "the app did not take it; press again")
 
     def close(self) -> None:
         self._why.close()
@@ -156,11 +176,18 @@ class Page:
         self._server.stop()
 
 
+def signed(said: Any, by: str) -> Any:
+    """A word with who said it and when, where it carries that."""
+    if isinstance(said, MarkAttempt):
+        return replace(said, mark=replace(said.mark, by=by, wall=now()))
+    return replace(said, by=by) if isinstance(said, Nudge | VersionWish) else said
+
+
 def serve(options: PageOptions, ended: threading.Event) -> None:
     """Run the page until `ended` is set or our parent is gone."""
     orphaned = die_with_parent()
     page = Page(options)
-    log.info("the operator page is at %s", page_url(options.host, page.port))
+    log.info("the operator page is at %s", page.url)
     gc.freeze()
     try:
         due = time.monotonic()
@@ -175,7 +202,8 @@ def serve(options: PageOptions, ended: threading.Event) -> None:
 def parse(arguments: Sequence[str] | None) -> PageOptions:
     parser = argparse.ArgumentParser(prog="python -m ui.server", description="The operator page of one run.")
     parser.add_argument("--run-folder", type=Path, required=True, help="folder with the run's sockets")
-    parser.add_argument("--host", default="127.0.0.1", help="loopback address to bind")
+    parser.add_argument("--host", default="127.0.0.1", help="address to bind; any but loopback needs --token")
+    parser.add_argument("--token", type=Path, default=None, help="file of the token, made where it is missing")
     parser.add_argument("--port", type=int, default=8080, help="0 lets the system choose")
     parser.add_argument("--operator", default="operator", help="name stored with every intent")
     parser.add_argument("--cameras", nargs="*", default=("front", "wrist"), help="views to show, the first two of them")

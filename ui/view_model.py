@@ -65,6 +65,7 @@ WORDS: dict[State, tuple[str, Tone]] = {
     State.READY: ("READY", Tone.IDLE),
     State.HOMING: ("GOING HOME", Tone.IDLE),
     State.RUNNING: ("RUNNING", Tone.RUN),
+    State.TAKEN_OVER: ("TAKEN OVER", Tone.LEARN),
     State.PAUSED: ("PAUSED", Tone.WARN),
     State.ADAPTING: ("LEARNING", Tone.LEARN),
     State.TRIAL_DONE: ("TRIAL DONE", Tone.IDLE),
@@ -123,6 +124,7 @@ def _detail(telemetry: Telemetry) -> str:
         State.READY: "Set up, nothing moves.",
         State.HOMING: f"{home.capitalize()}.",
         State.RUNNING: "First attempt, unperturbed." if t.attempt <= 1 else f"Retry {t.attempt - 1} after a failure.",
+        State.TAKEN_OVER: f"A person has the arm ({t.steering.ticks} ticks); hand back to let the policy go on.",
         State.PAUSED: "Held by the operator; Resume goes on.",
         State.TRIAL_DONE: f"{home.capitalize()}." if 0 < t.homing_progress < 1 else "The next trial follows.",
         State.AWAITING_SCENE: "Rebuild the scene, clear the workspace, then press Scene ready.",
@@ -147,6 +149,8 @@ _REASONS: dict[Intent, str] = {
     Intent.MARK_SUCCESS: _ATTEMPT_ONLY,
     Intent.MARK_FAILURE: _ATTEMPT_ONLY,
     Intent.SKIP_TRIAL: "no trial under way",
+    Intent.TAKE_OVER: _ATTEMPT_ONLY,
+    Intent.HAND_BACK: "the policy has the arm",
     Intent.SCENE_READY: "no scene is awaited",
     Intent.QUIT: "already finished",
 }
@@ -164,6 +168,8 @@ def control(intent: Intent, telemetry: Telemetry | None, fresh: Freshness) -> Co
         return Control(enabled=True)
     if telemetry.state is State.FINISHED:
         return Control(enabled=False, reason="the session is over")
+    if intent is Intent.TAKE_OVER and telemetry.steering.unavailable:
+        return Control(enabled=False, reason=telemetry.steering.unavailable)
     if telemetry.state in (State.STOPPED, State.FAULT):
         return Control(enabled=False, reason="Resume first")
     return Control(enabled=False, reason=_REASONS[intent])
@@ -239,21 +245,19 @@ class Gauge:
 
 
 def loop_gauges(telemetry: Telemetry | None) -> tuple[Gauge, ...]:
-    """How well the 30 Hz loop keeps time, and what the hw server had to do."""
+    """How well the 30 Hz loop keeps time, and what the hw server had to do; what matters most comes first, since a
+    narrow page shows as many as fit."""
     if telemetry is None:
         return ()
     loop, robot = telemetry.loop, telemetry.robot
-    moving = telemetry.state is State.RUNNING
+    moving = telemetry.state in (State.RUNNING, State.TAKEN_OVER)
     slow = moving and loop.hz > 0 and abs(loop.hz - telemetry.rate) > 0.05 * telemetry.rate
     gauges = [
         Gauge(label="loop", value=f"{loop.hz:.1f} Hz" if loop.hz else "– Hz", tone=Tone.WARN if slow else Tone.IDLE),
         Gauge(label="late p50", value=f"{loop.late_p50_ms:.1f} ms"),
         Gauge(label="p99", value=f"{loop.late_p99_ms:.1f} ms", tone=Tone.WARN if loop.late_p99_ms > 5 else Tone.IDLE),
-        Gauge(label="max", value=f"{loop.late_max_ms:.1f} ms"),
-        Gauge(label="late ticks", value=_of(loop.late_ticks, loop.ticks)),
         Gauge(label="overruns", value=str(loop.overruns), tone=Tone.BAD if loop.overruns else Tone.IDLE),
         Gauge(label="starved", value=str(loop.starved), tone=Tone.WARN if loop.starved else Tone.IDLE),
-        Gauge(label="plan age", value=f"{loop.plan_age_ticks:.1f} ticks"),
     ]
     if telemetry.engine:
         refused = ", ".join(r.split(":")[0] for r in telemetry.engine_refused)
@@ -262,11 +266,16 @@ def loop_gauges(telemetry: Telemetry | None) -> tuple[Gauge, ...]:
     if robot is not None:
         gauges.append(Gauge(label="holds", value=str(robot.holds), tone=Tone.WARN if robot.holds else Tone.IDLE))
         gauges.append(Gauge(label="clips", value=str(robot.clips)))
-    return tuple(gauges)
+    return (
+        *gauges,
+        Gauge(label="late ticks", value=_of(loop.late_ticks, loop.ticks)),
+        Gauge(label="max", value=f"{loop.late_max_ms:.1f} ms"),
+        Gauge(label="plan age", value=f"{loop.plan_age_ticks:.1f} ticks"),
+    )
 
 
-def arm_word(status: RobotStatus | None) -> tuple[str, Tone]:
-    """The arm's mode as the hw server itself reports it."""
+def arm_word(status: RobotStatus | None, person: bool = False) -> tuple[str, Tone]:
+    """The arm's mode as the hw server itself reports it; `person`: who leads it is no policy."""
     if status is None:
         return "arm unknown", Tone.WARN
     tone = {
@@ -277,7 +286,7 @@ def arm_word(status: RobotStatus | None) -> tuple[str, Tone]:
     }[status.mode]
     words = {
         RobotMode.HOLD: "arm holds",
-        RobotMode.TRACKING: "arm follows the policy",
+        RobotMode.TRACKING: "arm follows a person" if person else "arm follows the policy",
         RobotMode.HOMING: f"arm goes home, {100 * status.homing_progress:.0f} %",
         RobotMode.LATCHED: "arm latched",
     }[status.mode]

@@ -34,8 +34,8 @@ def head(case: Case | None, found: Attribution | None, tick: int, attempt: int, 
     name = case.name if case is not None else "attempt"
     last = case.length - 1 if case is not None else 0
     share = 100 * tick / last if last > 0 else 0
-    return f"""<div class="far-head tone-{tone}" id="why-state" data-outcome="{escape(word)}" data-tick="{tick}"
- data-attempt="{attempt}" data-flagged="{len(flagged)}" data-place="{place}">
+    return f"""<div class="far-head far-whyhead tone-{tone}" id="why-state" data-outcome="{escape(word)}"
+ data-tick="{tick}" data-attempt="{attempt}" data-flagged="{len(flagged)}" data-place="{place}">
 <div class="far-word">{escape(word)}</div>
 <div class="far-why"><p>{escape(line)}</p><p class="far-arm tone-idle">{escape(below)}</p></div>
 <div class="far-fact far-text"><span>attempt {attempt + 1} of {attempts}</span><b>{escape(name)}</b></div>

@@ -15,7 +15,9 @@ import viser
 from ui import why_html
 from ui.keys import Page, add_hotkey, hint, key_of
 from ui.page_server import Presses
+from ui.presence import Presence
 from ui.scene3d import BRAND
+from ui.viewers import Live, Viewers
 from ui.why_model import Attribution, Case
 from ui.why_scene import WhyScene
 from ui.why_state import Looking, Offer, Press
@@ -65,18 +67,22 @@ class Shown:
 class WhyPage:
     """One page for all clients. `show` from one thread only."""
 
-    def __init__(self, server: viser.ViserServer, *, scene3d: bool = True) -> None:
+    def __init__(self, server: viser.ViserServer, presence: Presence, *, scene3d: bool = True) -> None:
         self.events: queue.SimpleQueue[tuple[Press, float]] = queue.SimpleQueue()
         """What was pressed, oldest first; a slider's with its value."""
-        self._gui, self._presses = server.gui, Presses(server)
+        self._gui, self._presses = server.gui, Presses(server, presence)
+        self.refusals: queue.SimpleQueue[str] = queue.SimpleQueue()
+        """What was refused for want of control, and why."""
+        self._presses.refused = lambda what, why: self.refusals.put(f"{what} is refused: {why}")
         self._buttons: dict[Press, tuple[str, viser.GuiButtonHandle, viser.CommandHandle]] = {}
-        self._sliders: dict[Press, viser.GuiSliderHandle[Any]] = {}
+        self._sliders: list[tuple[Press, viser.GuiSliderHandle[Any]]] = []
         self._touched: dict[Press, float] = {}
         server.gui.configure_theme(dark_mode=True, brand_color=BRAND, show_logo=False, show_share_button=False)
         server.gui.set_panel_label("FAR: why did it fail")
         self._scene = WhyScene(server) if scene3d else None
         self._drawn: tuple[object, ...] = ()
         self._build()
+        self._viewers = Viewers(server, self._presses, presence, Page.WHY)
 
     def _build(self) -> None:
         gui = self._gui
@@ -90,6 +96,7 @@ class WhyPage:
         self._frames = gui.add_html(why_html.frames(None, 0, 0, False))
         gui.add_html(why_html.key())
         self._charts = gui.add_html(why_html.charts(None, 0))
+        self._add_slider(Press.TICK, "", 0, 150, 1, slot="pick")  # unseen, over the charts: a click or a drag there
         self._numbers = gui.add_html(why_html.numbers(None, None, 0, ""))
         self._foot = gui.add_html(why_html.foot("", (), "", ""))
         gui.add_html(f"<style>{_STYLE}\n@media (min-width: 768px) {{ {' '.join(places)} }}</style>")
@@ -103,16 +110,16 @@ class WhyPage:
         self._presses.on(command, lambda: self.events.put((press, 0.0)))
         self._buttons[press] = (label, handle, command)
         return (
-            f'div:has(> [id="{handle._impl.uuid}"]) {{ left: calc({(0.7, 11.15)[column]} * var(--u)); '
-            f"width: calc(9.9 * var(--u)); top: calc(var(--head) + {0.7 + 4.35 * row} * var(--u)); "
+            f'div:has(> [id="{handle._impl.uuid}"]) {{ left: calc({(0.7, 11.6)[column]} * var(--u)); '
+            f"width: calc(10.2 * var(--u)); top: calc(var(--head) + {0.7 + 4.35 * row} * var(--u)); "
             f"height: calc(3.85 * var(--u)); }}"
         )
 
-    def _add_slider(self, press: Press, label: str, low: float, high: float, step: float) -> None:
-        self._gui.add_html(f'<div class="why-slot slot-{press.value}">{label}</div>')
+    def _add_slider(self, press: Press, label: str, low: float, high: float, step: float, slot: str = "") -> None:
+        self._gui.add_html(f'<div class="why-slot slot-{slot or press.value}">{label}</div>')
         slider = self._gui.add_slider(" ", min=low, max=high, step=step, initial_value=low)
         self._presses.on_value(slider, lambda value: self._slid(press, value))
-        self._sliders[press] = slider
+        self._sliders.append((press, slider))
 
     def _slid(self, press: Press, value: float) -> None:
         self._touched[press] = time.monotonic()
@@ -133,11 +140,13 @@ class WhyPage:
             Press.CORRECT: "Unflag" if flagged else "Flag",
             Press.CRITIC: s.looking.choice.critic.rsplit("/", 1)[-1].removesuffix(".safetensors"),
         }
-        for press, (label, handle, command) in self._buttons.items():
+        live: list[Live] = []
+        for press, (label, handle, hotkey) in self._buttons.items():
             offer = s.offers[press]
-            handle.disabled, command.disabled = not offer.enabled, not offer.enabled
             line = f"{offer.line} · {hint(Page.WHY, press)}".removeprefix(" · ") if offer.enabled else offer.line
-            handle.label = f"{names.get(press, label)}\n{line}"
+            name = names.get(press, label)
+            live.append(Live(button=handle, hotkey=hotkey, enabled=offer.enabled, label=name, line=line))
+        self._viewers.show(live)
         self._set_sliders(s)
         if self._scene is not None:
             key = (id(case), id(found), tick, id(s.moved))
@@ -151,11 +160,10 @@ class WhyPage:
         values = {
             Press.TICK: s.looking.tick, Press.RHO: s.looking.choice.rho, Press.HORIZON: s.looking.choice.horizon,
         }  # fmt: skip
-        tick = self._sliders[Press.TICK]
-        if tick.max != last:
-            tick.value = min(tick.value, last)
-            tick.max = last
-        for press, slider in self._sliders.items():
+        for press, slider in self._sliders:
+            if press is Press.TICK and slider.max != last:
+                slider.value = min(slider.value, last)
+                slider.max = last
             settled = time.monotonic() - self._touched.get(press, 0.0) > _SETTLE
             if settled and slider.value != values[press]:
                 slider.value = values[press]

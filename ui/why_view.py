@@ -12,7 +12,8 @@ import numpy as np
 from far_app.recording.corrections import now as wall_clock
 from far_app.types import FlagCorrection
 from far_app.what_if import RECORDED, CorrectFlag
-from ui.page_server import open_page, page_url
+from ui.access import Access
+from ui.page_server import open_page
 from ui.presence import Presence
 from ui.why_asking import Asking
 from ui.why_link import Link
@@ -31,6 +32,8 @@ class WhyOptions:
     run_folder: Path
     attempt: Path | None = None
     host: str = "127.0.0.1"
+    token: Path | None = None
+    """File of what a browser must show; needed on any address but loopback."""
     port: int = 8081
     scene3d: bool = True
     operator: str = "operator"
@@ -42,10 +45,10 @@ class View:
     def __init__(self, options: WhyOptions) -> None:
         self._options = options
         self._sitting = Sitting(options.session)
-        server = open_page(options.host, options.port, Presence())
-        self.url = page_url(options.host, server.get_port())
-        self._server = server
-        self._page = WhyPage(server, scene3d=options.scene3d)
+        access, presence = Access.at(options.host, options.token), Presence()
+        self._server = server = open_page(access, options.port, presence)
+        self.url = access.url(server.get_port())
+        self._page = WhyPage(server, presence, scene3d=options.scene3d)
         self._link = Link(options.run_folder)
         self._asking = Asking(self._link)
         self._said = ""
@@ -66,6 +69,8 @@ class View:
                 self._pressed(*self._page.events.get_nowait())
         except queue.Empty:
             pass
+        while not self._page.refusals.empty():
+            self._said = self._page.refusals.get_nowait()
         self._asking.hear()
         self._refresh()
         self._case = self._read()

@@ -89,8 +89,16 @@ def measure(options: LoopOptions) -> dict[str, Any]:
 
 def naive_session(stage_: Stage, seconds: float) -> tuple[LoopStatistics, Attempt, tuple[float, float]]:
     """Trials under naive retry for so long; returns the last failed attempt too, and when it was."""
-    statistics, inbox = LoopStatistics(), IntentInbox()
     began = time.monotonic()
+    statistics, failure = naive_trials(stage_, seconds)
+    if failure is None:
+        raise FarError(f"no attempt failed within {seconds:g} s, so there is nothing to adapt from; measure for longer")
+    return statistics, failure, (began, time.monotonic())
+
+
+def naive_trials(stage_: Stage, seconds: float) -> tuple[LoopStatistics, Attempt | None]:
+    """Trials under naive retry for so long; returns the last failed attempt, if one failed."""
+    statistics, inbox = LoopStatistics(), IntentInbox()
     timer = threading.Timer(seconds, inbox.put, (Intent.QUIT,))
     timer.daemon = True
     with stage_.session(stage_.writer(), inbox, statistics, method=Unlearning(stage_.parts.method)) as session_:
@@ -98,9 +106,7 @@ def naive_session(stage_: Stage, seconds: float) -> tuple[LoopStatistics, Attemp
         session_.run()
     if session_.recorder.error is not None:
         raise session_.recorder.error
-    if session_.last_failure is None:
-        raise FarError(f"no attempt failed within {seconds:g} s, so there is nothing to adapt from; measure for longer")
-    return statistics, session_.last_failure, (began, time.monotonic())
+    return statistics, session_.last_failure
 
 
 class Unlearning:

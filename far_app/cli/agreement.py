@@ -10,8 +10,8 @@ from far_app.errors import ConfigError
 from far_app.station import Station
 from hw.rig import RigConfig
 
-ITS_OWN = ("xarm.address", "xarm.port")
-"""What only the machine beside the arm needs to know."""
+ITS_OWN = ("xarm.address", "xarm.port", "input_device.")
+"""Beginnings of what only the machine beside the arm needs to know."""
 
 
 def agreed(rig: RigConfig, task: str, station: Station) -> RigConfig:
@@ -21,7 +21,7 @@ def agreed(rig: RigConfig, task: str, station: Station) -> RigConfig:
             f"the hw server there is set up for task {station.task}, this run is for {task}; say --task {task} there, "
             f"or --task {station.task} here"
         )
-    apart = [d for d in differences(dataclasses.asdict(rig), station.rig) if d[0] not in ITS_OWN]
+    apart = [d for d in differences(dataclasses.asdict(rig), station.rig) if not d[0].startswith(ITS_OWN)]
     if apart:
         some = "; ".join(f"{name} is {here} here and {there} there" for name, here, there in apart[:3])
         raise ConfigError(

@@ -52,8 +52,12 @@ class RunOptions:
     """Attempts a trial; the task's by default."""
     port: int = 8080
     """The page's port; 0 takes a free one."""
+    operator: str = "operator"
+    """Your name, stored with what you say on attempts and chunks."""
     page_host: str = "127.0.0.1"
-    """Address the page binds to."""
+    """Address the page binds to; any but loopback needs --page-token."""
+    page_token: Path | None = None
+    """File of the token that a browser must show to open the page; made where it is missing."""
     rerun: bool = True
     """Show the session live in a rerun viewer too."""
     scene3d: bool = True

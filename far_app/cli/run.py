@@ -36,7 +36,9 @@ def main(arguments: Sequence[str]) -> int:
     if options.summary_json is not None:
         write_json(options.summary_json, {"trials": [told(r) for r in results], **statistics.summary()})
     counted = [r for r in results if r.counted]
-    apart = f"; {len(results) - len(counted)} that began at reduced speed not counted" * (counted != results)
+    apart = f"; {len(results) - len(counted)} that began at reduced speed, or with a person's help, not counted" * (
+        counted != results
+    )
     print(f"{sum(r.success for r in counted)} of {len(counted)} trials succeeded{apart}", flush=True)
     return 0
 

@@ -49,6 +49,7 @@ from far_app.tasks import task as find_task
 from hw.camera_config import with_views
 from hw.rig import RigConfig
 from hw.setup import setup_of
+from ui.access import Access
 
 HARDWARE_PATIENCE = 180.0
 """Seconds for the hw server's first observation (a first start compiles for a while)."""
@@ -150,6 +151,7 @@ def stage(options: RunOptions) -> Iterator[Stage]:
     rig = options.load_rig()
     task = with_views(find_task(options.task, rig.arm), rig.cameras)
     task = task if rig.robot == "twin" else supervised(task)
+    access = None if options.headless else Access.at(options.page_host, options.page_token)
     port = 0 if options.headless else choose_port(options.page_host, options.port)
     with run_folder() as folder, contextlib.ExitStack() as stack:
         family = Family()
@@ -178,8 +180,7 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         warm_up(parts.method.policy, robot)
         yield Stage(
             options=options, task=task, rig=rig, parts=parts, robot=robot, folder=folder, family=family,
-            hardware=hardware, page=page,
-            page_url=f"http://{options.page_host}:{port}" if page is not None else "",
+            hardware=hardware, page=page, page_url=access.url(port) if access is not None else "",
         )  # fmt: skip
 
 
@@ -205,7 +206,9 @@ def start_hardware(folder: Path, rig: str, task: str, address: str) -> Child:
 
 def start_page(folder: Path, options: RunOptions, port: int, cameras: Sequence[str]) -> Child:
     arguments = ["--run-folder", str(folder), "--host", options.page_host, "--port", str(port)]
+    arguments += ["--token", str(options.page_token.absolute())] if options.page_token is not None else []
     arguments += ["--cameras", *cameras, "--recordings", str(options.recordings.absolute())]
+    arguments += ["--operator", options.operator]
     arguments += ["--no-scene3d"] * (not options.scene3d) + ["--no-rerun"] * (not options.rerun)
     return Child("page", "ui.server", arguments, folder)
 

@@ -20,8 +20,9 @@ class Selection:
     """What to take."""
 
     only: Only = "all"
-    """successes: attempts judged so. recoveries: successes after a failed attempt on the same scene, or in which a
-    person stepped in. human: attempts in which a person moved the arm."""
+    """successes: attempts judged so by the last word; one of which a person is unsure is none. recoveries: successes
+    after a failed attempt on the same scene, or in which a person stepped in. human: attempts in which a person moved
+    the arm."""
     segment: Segment = "attempt"
     """recovery: from the failure's state, which is where a person first stepped in, else (a retry) its first tick, for
     the scene is as the failure left it. A first attempt without a person holds none."""
@@ -56,9 +57,13 @@ def chosen(sessions: Sequence[Path], selection: Selection, say: Callable[[str], 
                 say(f"{where} is left out: {why}")
                 continue
             assert recording.header is not None and recording.outcome is not None
-            outcome = session.marks.get((recording.header.trial, recording.header.attempt), recording.outcome)
+            key = recording.header.trial, recording.header.attempt
+            outcome = session.marks.get(key, recording.outcome)
             first = start_of(recording, selection.segment)
-            if wanted(recording, outcome, selection.only) and first is not None:
+            sure = key not in session.unsure
+            if not sure and selection.only in ("successes", "recoveries"):
+                say(f"{where} is left out: a person is unsure how it went")
+            elif wanted(recording, outcome, selection.only) and first is not None:
                 yield Chosen(session=session, recording=recording, outcome=outcome, first=first)
 
 

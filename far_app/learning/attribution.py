@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from far_app.config import AttributionConfig
 from far_app.errors import ConfigError
@@ -33,6 +33,14 @@ def value_change(values: Float[np.ndarray, "T+1"], horizon: int) -> Float[np.nda
     if len(values) <= horizon:
         return np.zeros(0)
     return values[horizon:] - values[:-horizon]
+
+
+def without_person(
+    changes: Float[np.ndarray, "C"], person: Bool[np.ndarray, "T"], horizon: int
+) -> Float[np.ndarray, "C"]:
+    """ΔV with NaN for every chunk in which a person moved the arm at some tick: nothing to blame the policy for."""
+    theirs = [bool(person[t : t + horizon].any()) for t in range(len(changes))]
+    return np.where(theirs, np.nan, changes) if theirs else changes
 
 
 def flag(changes: Float[np.ndarray, "C"], config: AttributionConfig) -> Flags:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from far_app.config import AttributionConfig
-from far_app.learning.attribution import corrected, flag, value_change
+from far_app.learning.attribution import corrected, flag, value_change, without_person
 from far_app.learning.cancellation import Cancelled, check
 from far_app.learning.critic import Critic
 from far_app.learning.memory import FeatureMemory
@@ -95,8 +95,10 @@ def attributed(
 ) -> Adaptation:
     """The adaptation with every V, every ΔV, and the chunks to blame."""
     found = values(eyes, attempt, cancelled)
-    changes = value_change(found, eyes.policy.config.horizon)
-    flags = flag(changes, config)
+    horizon = eyes.policy.config.horizon
+    changes = value_change(found, horizon)
+    person = np.array([step.intervention for step in attempt.steps], bool)
+    flags = flag(without_person(changes, person, horizon), config)
     return replace(
         adaptation, values=found, value_changes=changes, threshold=flags.threshold, corrections=attempt.corrections,
         flagged=corrected(flags.ticks, attempt.corrections, len(changes)),

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from far_app.config import RetryConfig
 from far_app.errors import ConfigError, FarError
 from far_app.learning import diffusion, fcpa
+from far_app.learning.adapted import denoiser_of
 from far_app.learning.cancellation import AdaptationCancelledError, Cancelled, check
 from far_app.learning.critic import Critic
 from far_app.learning.memory import FeatureMemory
@@ -68,7 +69,10 @@ class RetryMethod:
     def __init__(self, name: str, ingredients: Ingredients, adapts: bool, perturbs: bool) -> None:
         self.name = name
         self.adapts = adapts
-        self.base = ingredients.network
+        self._first = ingredients.network
+        """What it was made with; its encoder and normaliser are every version's."""
+        self.base = self._first
+        """With which trials begin."""
         self.critic = ingredients.critic
         self.memory = ingredients.memory
         self.arrange = ingredients.arrange
@@ -86,7 +90,10 @@ class RetryMethod:
         self._fingerprint = ""
         self._act = ingredients.act
         self._swap = threading.Lock()
-        self._base_policy = self._act(self.base, BASE_VERSION)
+        self._first_policy = self._base_policy = self._act(self.base, BASE_VERSION)
+        self._base_weights: AdaptedWeights | None = None
+        self._lessons: list[tuple[AdaptedWeights, list[Pairs]]] = []
+        """What each version of this trial was learnt from."""
         self._scene = 0
         self._trial = 0
         self._restore()
@@ -104,10 +111,12 @@ class RetryMethod:
             return nothing
         learning = _Learning(self, attempt, outdated, nothing)
         try:
-            if self.config.fcpa.hedge and version != BASE_VERSION:
+            if self.config.fcpa.hedge and version != self._base_policy.version:
                 learning.attribute(progress)
                 self._withdraw(outdated)
-                learning.note(status="withdrawn", version=BASE_VERSION, note="the lesson failed: a plain try next")
+                learning.note(
+                    status="withdrawn", version=self._base_policy.version, note="the lesson failed: a plain try next"
+                )
                 return learning.adaptation
             denoiser, pairs = learning.run(progress)
             if denoiser is not None:
@@ -119,6 +128,19 @@ class RetryMethod:
             learning.note(status="failed", note=str(error))
         return learning.adaptation
 
+    def use(self, weights: AdaptedWeights | None, version: str, *, base: bool) -> None:
+        """far_app.protocols.ChangesWeights."""
+        network, policy = self._first, self._first_policy
+        if weights is not None:
+            self._fingerprint = self._fingerprint or fingerprint(self._first)
+            network = with_denoiser(self._first, denoiser_of(weights, self._first, self._fingerprint))
+            policy = self._act(network, version)
+        with self._swap:
+            self.acting, self.policy, self.adapted = network, policy, weights
+            self.rounds = next((list(pairs) for known, pairs in self._lessons if known is weights), [])
+            if base:
+                self.base, self._base_policy, self._base_weights = network, policy, weights
+
     def perturb(self, attempt_index: int, scene_seed: int) -> Perturbation:
         return perturbation(self.perturbation, scene_seed, attempt_index)
 
@@ -126,8 +148,9 @@ class RetryMethod:
         self._trial += 1
         self.acting = self.base
         self.policy = self._base_policy
-        self.adapted = None
+        self.adapted = self._base_weights
         self.rounds: list[Pairs] = []
+        self._lessons.clear()
         self._adaptations = 0
 
     def _withdraw(self, outdated: Cancelled) -> None:
@@ -140,7 +163,7 @@ class RetryMethod:
         """Swap the acting policy, unless a new trial began or nobody waits any more."""
         network = with_denoiser(self.base, denoiser)
         policy = self._act(network, f"{BASE_VERSION}+a{self._adaptations + 1}")
-        self._fingerprint = self._fingerprint or fingerprint(self.base)
+        self._fingerprint = self._fingerprint or fingerprint(self._first)
         parent = self.policy if self.config.fcpa.accumulate else self._base_policy
         weights = AdaptedWeights(
             version=policy.version, parent=parent.version, base=self._fingerprint,
@@ -149,7 +172,8 @@ class RetryMethod:
         with self._swap:
             check(outdated)
             self._adaptations += 1
-            self.rounds.append(pairs)
+            self.rounds = [*self.rounds, pairs]
+            self._lessons.append((weights, self.rounds))
             self.acting, self.policy, self.adapted = network, policy, weights
 
 

@@ -6,16 +6,12 @@ corrections.jsonl beside it, one line each, in the same form. Called by `far rep
 
 from __future__ import annotations
 
-import json
-import os
 import time
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 
-from far_app.errors import RecordingError
-from far_app.recording.codec import codec, decode
 from far_app.recording.reader import SessionRecording
+from far_app.recording.said_lines import append_line, now, read_lines
 from far_app.recording.schema import LogEntry
 from far_app.types import FlagCorrection
 
@@ -43,36 +39,19 @@ def detail(word: Word, used: bool) -> dict[str, object]:
     }  # fmt: skip
 
 
-def now() -> str:
-    """The wall clock, ISO 8601 with the offset to UTC."""
-    return datetime.now().astimezone().isoformat(timespec="milliseconds")
-
-
 def append(session: Path, word: Word) -> None:
     """Add a word to a closed session's corrections; on the disk when it returns. Raises RecordingError."""
     entry = LogEntry(
         event=EVENT, stamp=time.monotonic(), wall=word.correction.wall or now(), trial=word.trial,
         attempt=word.attempt, detail=detail(word, used=False),
     )  # fmt: skip
-    line = json.dumps(codec(LogEntry).encode(entry), separators=(",", ":"), ensure_ascii=False) + "\n"
-    file = session / CORRECTIONS_FILE
-    try:
-        with file.open("ab") as output:
-            if output.tell() and not _ends_a_line(file):
-                output.write(b"\n")  # a line that a crash cut off stays as it is; ours begins anew
-            output.write(line.encode())
-            output.flush()
-            os.fsync(output.fileno())
-    except OSError as error:
-        raise RecordingError(
-            f"cannot write {file}: {error.strerror}; copy the session to a folder you may write to"
-        ) from error
+    append_line(session / CORRECTIONS_FILE, entry)
 
 
 def corrections(session: SessionRecording) -> tuple[Corrections, list[str]]:
     """Every word on this session's chunks, and what of them cannot be read."""
     words, problems = {}, []
-    after, cut = _read(session.path / CORRECTIONS_FILE)
+    after, cut = read_lines(session.path / CORRECTIONS_FILE)
     for entry in [*(e for e in session.log if e.event == EVENT), *after]:
         d = entry.detail
         try:
@@ -85,26 +64,3 @@ def corrections(session: SessionRecording) -> tuple[Corrections, list[str]]:
             continue
         words[key] = (*words.get(key, ()), word)
     return words, [*problems, *cut]
-
-
-def _read(file: Path) -> tuple[list[LogEntry], list[str]]:
-    try:
-        lines = file.read_bytes().split(b"\n")
-    except FileNotFoundError:
-        return [], []
-    except OSError as error:
-        return [], [f"{file.name} cannot be read: {error.strerror}"]
-    entries, problems = [], []
-    for number, line in enumerate(lines, start=1):
-        try:
-            if line:
-                entries.append(decode(LogEntry, json.loads(line), file.name))
-        except (ValueError, RecordingError):
-            problems.append(f"line {number} of {file.name} is damaged or cut off")
-    return entries, problems
-
-
-def _ends_a_line(file: Path) -> bool:
-    with file.open("rb") as existing:
-        existing.seek(-1, os.SEEK_END)
-        return existing.read(1) == b"\n"

@@ -14,7 +14,8 @@ from far_app.types import Attempt, Outcome
 
 
 def session_episodes(path: Path, task: str) -> list[Episode]:
-    """Successes and failures of a session, in order; an attempt that was abandoned or cut off is left out. Raises
+    """Successes and failures of a session, in order; an attempt that was abandoned or cut off, or of which a
+    person is unsure, is left out. Raises
     ConfigError for a session of another task."""
     session = read_session(path)
     if session.header.info.task != task:
@@ -27,8 +28,9 @@ def session_episodes(path: Path, task: str) -> list[Episode]:
             continue
         if not attempt.steps or recording.header is None:
             continue
-        outcome = session.marks.get((recording.header.trial, recording.header.attempt), attempt.outcome)
-        episodes.append(judged_episode(attempt, outcome))
+        key = recording.header.trial, recording.header.attempt
+        if key not in session.unsure:
+            episodes.append(judged_episode(attempt, session.marks.get(key, attempt.outcome)))
     return episodes
 
 

@@ -17,9 +17,13 @@ import numpy as np
 from mcap.records import Message
 
 from far_app.errors import RecordingError
+from far_app.marks import Mark, Verdict
 from far_app.recording.append_file import being_written
 from far_app.recording.codec import Json, decode
 from far_app.recording.images import LazyImages, decode_png
+from far_app.recording.marks import MARKS_FILE, marks_in
+from far_app.recording.migrations import migrated, readable
+from far_app.recording.said_lines import read_lines
 from far_app.recording.scan import Scan, scan
 from far_app.recording.schema import (
     CAMERA_TOPIC,
@@ -37,6 +41,7 @@ from far_app.types import (
     Adaptation,
     AdaptationStep,
     Attempt,
+    Judge,
     Observation,
     Outcome,
     Step,
@@ -109,6 +114,8 @@ class SessionRecording:
     live: bool
     """A living process is still writing."""
     problems: tuple[str, ...]
+    words: tuple[Mark, ...] = ()
+    """People's words on attempts, oldest first, those said after the session was closed included."""
 
     def attempts(self) -> Iterator[AttemptRecording]:
         """Every attempt, one at a time."""
@@ -117,22 +124,36 @@ class SessionRecording:
 
     @cached_property
     def marks(self) -> dict[tuple[int, int], Outcome]:
-        """(trial, attempt) to the last word said on it, marks made after its file was closed included."""
+        """(trial, attempt) to the last verdict on it, those given after its file was closed included; being unsure
+        changes none (see `unsure`)."""
         words = {}
         for entry in self.log:
             if entry.event in ("attempt_ended", "outcome_marked"):
                 known = {key: entry.detail.get(key) for key in ("success", "judged_by", "note")}
                 words[entry.trial, entry.attempt] = decode(Outcome, known, f"{self.path / TRIALS_FILE}: {entry.event}")
+        for word in self.words:
+            if word.verdict in (Verdict.SUCCESS, Verdict.FAILURE):
+                words[word.trial, word.attempt] = Outcome(
+                    success=word.verdict is Verdict.SUCCESS, judged_by=Judge.OPERATOR, note=word.note
+                )
         return words
+
+    @cached_property
+    def unsure(self) -> frozenset[tuple[int, int]]:
+        """(trial, attempt) of which a person said last that it is not sure how it went."""
+        last = {(word.trial, word.attempt): word.verdict for word in self.words if word.verdict is not None}
+        return frozenset(key for key, verdict in last.items() if verdict is Verdict.UNSURE)
 
 
 def read_session(path: Path) -> SessionRecording:
     """Raises RecordingError when the folder holds no session or one of another schema."""
     header = _read_header(path)
-    log, problems = _read_log(path / TRIALS_FILE)
+    log, problems = _read_log(path / TRIALS_FILE, header.schema_version)
+    afterwards, cut = read_lines(path / MARKS_FILE)
+    words, damaged = marks_in([*log, *afterwards])
     return SessionRecording(
         path=path, header=header, log=tuple(log), files=tuple(sorted(path.glob("trial_*/attempt_*.mcap"), key=_order)),
-        live=being_written(path / TRIALS_FILE), problems=tuple(problems),
+        live=being_written(path / TRIALS_FILE), problems=(*problems, *cut, *damaged), words=tuple(words),
     )  # fmt: skip
 
 
@@ -140,8 +161,6 @@ def read_attempt(path: Path) -> AttemptRecording:
     """Raises RecordingError when there is no such file, it is not MCAP, or it is of another schema."""
     found = scan(path)
     parts = _Parts(path, found)
-    if parts.header is not None and parts.header.schema_version != SCHEMA_VERSION:
-        raise RecordingError(_other_version(path, parts.header.schema_version))
     return parts.recording()
 
 
@@ -160,6 +179,11 @@ class _Parts:
         self._by_topic: dict[str, list[Message]] = {}
         for topic, message in self.found.messages:
             self._by_topic.setdefault(topic, []).append(message)
+        self._version = SCHEMA_VERSION  # of a file whose header is lost: what it lacks reads as the defaults
+        for body in self._bodies("/attempt"):
+            if isinstance(body, dict) and "schema_version" in body:
+                self._version = readable(body["schema_version"], self.path)
+                break
         headers = self._values("/attempt", AttemptHeader)
         self.header = headers[0] if headers else None
         self._frames = {
@@ -216,8 +240,8 @@ class _Parts:
         bodies = []
         for message in self._by_topic.get(topic, []):
             try:
-                bodies.append(json.loads(message.data))
-            except ValueError:
+                bodies.append(migrated(topic, json.loads(message.data), self._version))
+            except (ValueError, KeyError, TypeError, AttributeError):
                 self._unreadable += 1
         return bodies
 
@@ -233,7 +257,7 @@ class _Parts:
     def _step(self, message: Message) -> Step | None:
         what = f"{self.path} /step {message.sequence}"
         try:
-            body = json.loads(message.data)
+            body = migrated("/step", json.loads(message.data), self._version)
             images = self._images(body["observation"].pop("frames"))
             step = decode(Step, body, what)
         except (ValueError, KeyError, TypeError, AttributeError, RecordingError):
@@ -274,12 +298,11 @@ def _read_header(path: Path) -> SessionHeader:
         raise RecordingError(f"{file} cannot be read: {error}") from error
     if not isinstance(body, dict) or body.get("schema") != SCHEMA_NAME:
         raise RecordingError(f"{file} is not a recording of this program (schema is not '{SCHEMA_NAME}')")
-    if body.get("schema_version") != SCHEMA_VERSION:
-        raise RecordingError(_other_version(path, body.get("schema_version")))
-    return decode(SessionHeader, body, str(file))
+    version = readable(body.get("schema_version"), path)
+    return decode(SessionHeader, migrated(SESSION_FILE, body, version), str(file))
 
 
-def _read_log(file: Path) -> tuple[list[LogEntry], list[str]]:
+def _read_log(file: Path, version: int) -> tuple[list[LogEntry], list[str]]:
     try:
         lines = file.read_bytes().split(b"\n")
     except OSError as error:
@@ -288,17 +311,10 @@ def _read_log(file: Path) -> tuple[list[LogEntry], list[str]]:
     entries = []
     for number, line in enumerate(lines[:-1], start=1):
         try:
-            entries.append(decode(LogEntry, json.loads(line), file.name))
-        except (ValueError, RecordingError) as error:
+            entries.append(decode(LogEntry, migrated(TRIALS_FILE, json.loads(line), version), file.name))
+        except (ValueError, KeyError, TypeError, AttributeError, RecordingError) as error:
             problems.append(f"line {number} of {file.name} is damaged: {error}")
     return entries, problems
-
-
-def _other_version(path: Path, version: object) -> str:
-    return (
-        f"{path} was recorded with schema version {version}, this program reads version {SCHEMA_VERSION}; "
-        "open it with the program's version named in its session.json (code_version)"
-    )
 
 
 def _order(file: Path) -> tuple[int, int, str]:

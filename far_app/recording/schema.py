@@ -15,8 +15,9 @@ from far_app.recording.codec import Json, codec
 from far_app.types import ActionChunk, Adaptation, AdaptationStep, Observation, Outcome, Step
 
 SCHEMA_NAME = "far-recording"
-SCHEMA_VERSION = 1
-"""Rises when an older reader would misread a newer file; a field added with a default does not raise it."""
+SCHEMA_VERSION = 2
+"""Rises when an older reader would misread a newer file; a field added with a default does not raise it by itself.
+Older files are read through migrations.py, which also says what each version brought."""
 
 SESSION_FILE = "session.json"
 TRIALS_FILE = "trials.jsonl"
@@ -198,6 +199,14 @@ LINES = {
     "outcome_marked": "someone's word on an attempt: `detail.success`, `detail.judged_by`, `detail.note`",
     "flag_corrected": "the operator's word on a chunk: `detail.trial`, `detail.attempt`, `detail.tick`, "
     "`detail.flagged`, `detail.by`, `detail.used` (it came in time for the adaptation)",
+    "attempt_marked": "a person's word on an attempt: `detail.trial`, `detail.attempt`, `detail.verdict` (success, "
+    "failure, unsure, or empty for a note alone), `detail.note`, `detail.by`; of a closed session it is a line of "
+    "marks.jsonl",
+    "policy_undone": "the next attempt acts with `detail.version`, from before an adaptation; `detail.by`",
+    "policy_restored": "the next attempt acts with `detail.version`; `detail.by`",
+    "policy_kept": "the next trials begin with `detail.version`; `detail.by`",
+    "taken_over": "a person has the arm from here on: `detail.source` (page or device)",
+    "handed_back": "the policy has it again; `detail.ticks` of this attempt were a person's",
     "trial_ended": "`detail.success`, `detail.attempts`",
     "recording_failed": "the writer gave up; `text` says why",
     "recorder_late": "the writer was more than 1 s behind the loop; `detail.seconds`",

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
+from safetensors.numpy import load_file
 
 from far_app.errors import RecordingError
 from far_app.recording.codec import encode_float
@@ -105,6 +106,16 @@ def read_kept(path: Path) -> Kept:
         )  # fmt: skip
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise RecordingError(f"{path} is truncated or no file of adapted weights ({error})") from error
+
+
+def read_weights(path: Path) -> AdaptedWeights:
+    """The weights again. Raises RecordingError when the file is damaged, missing or of another kind."""
+    kept = read_kept(path)
+    try:
+        tensors = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise RecordingError(f"{path} cannot be read ({error})") from error
+    return AdaptedWeights(version=kept.version, parent=kept.parent, base=kept.base, tensors=tensors)
 
 
 def _pair(text: str) -> tuple[float, float]:

@@ -8,9 +8,12 @@ from collections import deque
 import numpy as np
 
 from far_app.config import TaskConfig
+from far_app.lineage import Versions
 from far_app.motion import ActionScale
 from far_app.protocols import EngineReport
-from far_app.session_states import State, allowed
+from far_app.session.history import History
+from far_app.session_states import Intent, State
+from far_app.take_over import Steering
 from far_app.telemetry import LogLine, Telemetry, TrialRow
 from far_app.types import ActionChunk, Adaptation, AdaptationStep, Observation, Step, Trial
 
@@ -24,7 +27,7 @@ class Board:
         self._task, self._scale = task, scale
         self._session, self._method, self._trials = session, method, trials
         self._chunk_horizon = chunk_horizon
-        self._history = deque[TrialRow](maxlen=200)
+        self.history = History()
         self._log = deque[LogLine](maxlen=50)
         self._values: list[float] = []
         self._step: Step | None = None
@@ -38,6 +41,8 @@ class Board:
         self.countdown = 0.0
         """Seconds until an announced attempt begins."""
         self.refusal = ""
+        self.steering = Steering()
+        self.versions = Versions()
         self.adaptation_steps: tuple[AdaptationStep, ...] = ()
         self.adapting = False
         self.trial = self.attempt = self.scene_seed = 0
@@ -81,7 +86,7 @@ class Board:
         self.adaptation_steps = adaptation.history or self.adaptation_steps
 
     def trial_ended(self, trial: Trial, judged_by: str, note: str, counted: bool = True) -> None:
-        self._history.append(
+        self.history.trial_ended(
             TrialRow(
                 trial=self.trial, scene_seed=self.scene_seed, attempts=len(trial.attempts), success=trial.success,
                 judged_by=judged_by, flagged=sum(len(a.flagged) for a in trial.adaptations),
@@ -89,7 +94,7 @@ class Board:
             )
         )  # fmt: skip
 
-    def telemetry(self, state: State, newest: Observation | None) -> Telemetry:
+    def telemetry(self, state: State, newest: Observation | None, allowed: tuple[Intent, ...] = ()) -> Telemetry:
         """A snapshot; sequence number, stamp and loop health are the publisher's."""
         curve, latest, step = self._curve, self._latest, self._step
         values = curve.values if curve is not None and len(curve.values) else self._values
@@ -111,7 +116,9 @@ class Board:
             robot=newest.status if newest else None, joints=newest.joints if newest else np.zeros(0),
             eef=newest.eef if newest else None, gripper=newest.gripper if newest else 0.0,
             action=step.commanded if step is not None else np.zeros(0), chunk_path=self._path(newest),
-            history=tuple(self._history), log=tuple(self._log), refusal=self.refusal, allowed=allowed(state),
+            history=self.history.trials,
+            attempts=self.history.attempts, log=tuple(self._log), refusal=self.refusal, allowed=allowed,
+            steering=self.steering, versions=self.versions,
         )  # fmt: skip
 
     def _path(self, newest: Observation | None) -> np.ndarray:

@@ -6,15 +6,23 @@ import logging
 import queue
 import threading
 import time
+from typing import Any, TypeVar
 
 import zmq
 
+from far_app.lineage import VersionWish
+from far_app.marks import MarkAttempt
 from far_app.session_states import Intent
+from far_app.take_over import Nudge
 from far_app.telemetry import OperatorIntent, PagePresence
 from far_app.what_if import CorrectFlag
 from far_app.wire import WireError, unpack
 
 log = logging.getLogger(__name__)
+
+WORDS = (CorrectFlag, Nudge, MarkAttempt, VersionWish)
+"""What the page may say besides an intent."""
+_W = TypeVar("_W")
 
 
 class IntentInbox:
@@ -22,7 +30,7 @@ class IntentInbox:
 
     def __init__(self, endpoint: str | None = None) -> None:
         self._queue: queue.SimpleQueue[Intent] = queue.SimpleQueue()
-        self._words: queue.SimpleQueue[CorrectFlag] = queue.SimpleQueue()
+        self._words: dict[type, queue.SimpleQueue[Any]] = {kind: queue.SimpleQueue() for kind in WORDS}
         self.looked_at = time.monotonic()
         """When somebody was last known to have the page open."""
         self._closing = threading.Event()
@@ -44,11 +52,15 @@ class IntentInbox:
             intents.append(self._queue.get_nowait())
         return intents
 
-    def words(self) -> list[CorrectFlag]:
-        """The operator's words on chunks since the last call, oldest first; never waits."""
-        words = []
-        while not self._words.empty():
-            words.append(self._words.get_nowait())
+    def say(self, word: CorrectFlag | Nudge | MarkAttempt | VersionWish) -> None:
+        """One of WORDS, from any thread."""
+        self._words[type(word)].put(word)
+
+    def take(self, kind: type[_W]) -> list[_W]:
+        """The operator's words of this kind since the last call, oldest first; never waits."""
+        words: list[_W] = []
+        while not self._words[kind].empty():
+            words.append(self._words[kind].get_nowait())
         return words
 
     def close(self) -> None:
@@ -69,7 +81,9 @@ class IntentInbox:
             if isinstance(message, OperatorIntent):
                 log.info("operator: %s", message.intent)
                 self._queue.put(message.intent)
-            elif isinstance(message, CorrectFlag):
-                self._words.put(message)
+            elif isinstance(message, WORDS):
+                if isinstance(message, Nudge):
+                    self.looked_at = time.monotonic()  # a press: somebody is there
+                self.say(message)
             elif isinstance(message, PagePresence) and message.clients > 0:
                 self.looked_at = time.monotonic()

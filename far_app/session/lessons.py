@@ -8,14 +8,15 @@ from far_app.protocols import KeepsWeights, Method
 from far_app.session.adaptation import BackgroundAdaptation, unchanged
 from far_app.session.lockstep import FinishedAdaptation
 from far_app.session.standing import Standing
+from far_app.session.versions import VersionKeeper
 from far_app.trial import RunningAdaptation
 from far_app.types import Adaptation, Attempt
 from far_app.what_if import CorrectFlag
 
 
 class Lessons:
-    def __init__(self, standing: Standing, *, session: str, limit: float) -> None:
-        self.standing = standing
+    def __init__(self, standing: Standing, versions: VersionKeeper, *, session: str, limit: float) -> None:
+        self.standing, self.versions = standing, versions
         self._session = session
         """The session's name: a word on another session's chunk is not kept here."""
         self._limit = limit
@@ -76,8 +77,10 @@ class Lessons:
         self.standing.board.adapted(adaptation)
         self.standing.recorder.add_adaptation(adaptation)
         weights = method.adapted if isinstance(method, KeepsWeights) else None
-        if weights is not None and weights.version == adaptation.version != adaptation.base_version:
+        new = weights is not None and weights.version == adaptation.version != adaptation.base_version
+        if weights is not None and new:
             self.standing.recorder.add_weights(weights, adaptation)
+        self.versions.adapted(adaptation, weights if new else None)
         note = f" ({adaptation.note})" if adaptation.note else ""
         self.standing.say(f"adaptation: {adaptation.status}, {adaptation.pairs} pairs → {adaptation.version}{note}")
 

@@ -5,37 +5,66 @@ from __future__ import annotations
 import time
 
 from far_app.errors import RobotError
+from far_app.lineage import VersionWish
+from far_app.marks import MarkAttempt
 from far_app.protocols import Resume
 from far_app.session.inbox import IntentInbox
+from far_app.session.marking import Marking
 from far_app.session.standing import Standing
-from far_app.session_states import Intent, State, refusal
+from far_app.session.steering import Helper
+from far_app.session.versions import VersionKeeper
+from far_app.session_states import Intent, State
+from far_app.take_over import Source
 from far_app.types import Judge, Outcome, RobotMode
 
 
 class Operator:
     """The intents of an inbox, acted on."""
 
-    def __init__(self, inbox: IntentInbox, standing: Standing, period: float) -> None:
-        self.inbox, self.standing = inbox, standing
+    def __init__(
+        self,
+        inbox: IntentInbox,
+        standing: Standing,
+        helper: Helper,
+        marking: Marking,
+        versions: VersionKeeper,
+        period: float,
+    ) -> None:
+        self.inbox, self.standing, self.helper, self.marking = inbox, standing, helper, marking
+        self.versions = versions
         self.board, self.robot, self.recorder = standing.board, standing.robot, standing.recorder
         self._period = period
         """Of the loop, seconds."""
 
     def attend(self, phase: str) -> None:
         """Do what was asked since the last call. `phase`: of the trial, far_app/trial.py's or "between"."""
+        self.standing.phase = phase
         for intent in self.inbox.drain():
             self.ask(intent, phase)
+        pressed = self.helper.pressed()
+        if pressed is not None:
+            self.ask(pressed, phase, Source.DEVICE)
+        self.listen()
 
-    def ask(self, intent: Intent, phase: str) -> None:
+    def listen(self) -> None:
+        """What is no intent: presses that move the arm, words on attempts and policy versions."""
+        self.helper.nudge()
+        for mark in self.inbox.take(MarkAttempt):
+            self.marking.hear(mark)
+        for wish in self.inbox.take(VersionWish):
+            self.versions.hear(wish)
+        self.board.steering, self.board.versions = self.helper.told(), self.versions.told()
+
+    def ask(self, intent: Intent, phase: str, source: Source = Source.PAGE) -> None:
         """Refuse an intent with a reason, or obey it."""
-        why = refusal(self.standing.state, intent)
+        why = self.standing.refusal(intent)
         self.board.refusal = why
         if why:
             self.standing.say(why, "warning")
         else:
-            self._obey(intent, phase)
+            self._obey(intent, phase, source)
 
-    def _obey(self, intent: Intent, phase: str) -> None:
+    def _obey(self, intent: Intent, phase: str, source: Source) -> None:
         """Do what an intent asks and take its transition."""
         self.recorder.event("intent", intent.value)
         match intent:
@@ -59,6 +88,10 @@ class Operator:
                 self.standing.rule(success=False, note="skipped by the operator")
                 if phase == "homing":
                     self.standing.hold("trial skipped by the operator")
+            case Intent.TAKE_OVER:
+                self.helper.take(source)
+            case Intent.HAND_BACK:
+                self.helper.hand_back()
             case Intent.QUIT:
                 self.standing.hold("the session was ended by the operator")
         self.standing.happen(intent)

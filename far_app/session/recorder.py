@@ -4,6 +4,7 @@ surfacing in the middle of whatever the loop was doing."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from far_app.errors import RecordingError
@@ -22,6 +23,11 @@ class Recorder:
     def error(self) -> RecordingError | None:
         """Why nothing more is recorded."""
         return self._error or (self._writer.error if self._writer is not None else None)
+
+    @property
+    def folder(self) -> Path | None:
+        """The session's folder; None without a writer."""
+        return self._writer.folder if self._writer is not None else None
 
     def begin_trial(self, trial: int, scene_seed: int) -> None:
         self._hand(lambda w: w.begin_trial(trial, scene_seed))

@@ -23,15 +23,18 @@ from far_app.session.board import Board
 from far_app.session.clock import TickClock
 from far_app.session.inbox import IntentInbox
 from far_app.session.lessons import Lessons
+from far_app.session.marking import Marking
 from far_app.session.operator import Operator
 from far_app.session.planners import ThreadedPlanner
 from far_app.session.publisher import TelemetryPublisher
 from far_app.session.realtime import collect_between, collector_off
 from far_app.session.recorder import Recorder
 from far_app.session.settings import SessionSettings, TrialResult
-from far_app.session.standing import Standing
+from far_app.session.standing import IN_ATTEMPT, Standing
 from far_app.session.statistics import LoopStatistics
+from far_app.session.steering import Helper
 from far_app.session.supervision import Supervision, TrialAbandoned
+from far_app.session.versions import VersionKeeper
 from far_app.session.watched import WatchedRobot
 from far_app.session_states import Happening, State
 from far_app.trial import (
@@ -45,6 +48,7 @@ from far_app.trial import (
     trial,
 )
 from far_app.types import Attempt, Step, Trial
+from far_app.what_if import CorrectFlag
 
 log = logging.getLogger(__name__)
 
@@ -76,14 +80,21 @@ class Session:
             chunk_horizon=method.policy.spec.horizon,
         )  # fmt: skip
         self.standing = Standing(
-            robot=self.robot, override=self.detector, recorder=recorder, board=self.board, publisher=publisher
+            robot=self.robot, override=self.detector, recorder=recorder, board=self.board, publisher=publisher,
+            no_take_over=settings.no_take_over,
+        )  # fmt: skip
+        self.helper = Helper(self.standing, inbox, scale)
+        marking = Marking(self.standing, settings.name)
+        self.versions = VersionKeeper(self.standing, method, recorder.folder)
+        self.inbox, self.operator = (
+            inbox,
+            Operator(inbox, self.standing, self.helper, marking, self.versions, self.clock.period),
         )
-        self.inbox, self.operator = inbox, Operator(inbox, self.standing, self.clock.period)
         self.supervision = Supervision(
-            standing=self.standing, operator=self.operator, planner=planner, clock=self.clock,
+            standing=self.standing, operator=self.operator, helper=self.helper, planner=planner, clock=self.clock,
             freshness=settings.freshness, headless=settings.headless, page_silence=settings.page_silence,
         )  # fmt: skip
-        self.lessons = Lessons(self.standing, session=settings.name, limit=settings.adaptation_limit)
+        self.lessons = Lessons(self.standing, self.versions, session=settings.name, limit=settings.adaptation_limit)
         self.results: list[TrialResult] = []
         self.last_failure: Attempt | None = None
         """The newest failed attempt."""
@@ -128,13 +139,14 @@ class Session:
         self.standing.trial_begins()
         self._seed, self._attempts = seed, []
         self.lessons.trial_begins()
+        self.versions.trial_begins()
         self.board.trial_started(number, seed)
         self.recorder.begin_trial(number, seed)
         self.standing.say(f"trial {number}: scene {seed}")
         self._stretch = self.settings.first_stretch if number == 1 else 1
         events = trial(
             seed, self.robot, self.planner, self.method, self.detector, self.task, self.scale, self.lessons.start,
-            self._stretch, self.alarm,
+            self._stretch, self.alarm, self.helper,
         )  # fmt: skip
         answer: float | None = None
         try:
@@ -176,7 +188,7 @@ class Session:
         self.standing.show()
         due = self.clock.wait()
         held = self.supervision.attend(tick.phase)
-        if held and tick.phase == "attempt" and self.standing.state is State.RUNNING:
+        if held and tick.phase == "attempt" and self.standing.state in IN_ATTEMPT:
             self._prime()
             self.clock.restart()
             due = AfterHold(self.clock.wait())
@@ -190,10 +202,12 @@ class Session:
         self.supervision.count_down(self.settings.countdown, f"attempt {event.attempt_index}{pace}")
         self.standing.happen(Happening.AT_HOME)
         self.standing.no_lesson = False
-        self.board.attempt_started(event.attempt_index, event.policy_version)
+        self.helper.attempt_begins()
+        version = self.versions.attempt_begins(event.policy_version)
+        self.board.attempt_started(event.attempt_index, version)
         if isinstance(self.method.policy, RunsOnEngine):
             self._runs_on(self.method.policy.runs_on)
-        self.recorder.begin_attempt(event.attempt_index, event.policy_version)
+        self.recorder.begin_attempt(event.attempt_index, version)
         if slowly:
             self.standing.say(f"attempt {event.attempt_index} runs at 1/{self._stretch} of the policy's speed")
             self.recorder.event("reduced_speed", pace.strip(), {"stretch": self._stretch})
@@ -219,6 +233,8 @@ class Session:
             self._record(step)
         self._report()
         self.recorder.end_attempt(attempt)
+        self.board.history.attempt_ended(self.board.trial, attempt)
+        self.versions.attempt_ended(attempt.outcome.success)
         self._in_attempt = False
         self._attempts.append(attempt)
         self.last_failure = self.last_failure if attempt.outcome.success else attempt
@@ -249,9 +265,11 @@ class Session:
         result = Trial(scene_seed=self._seed, attempts=tuple(self._attempts), adaptations=tuple(self.lessons.learnt))
         last = self._attempts[-1].outcome if self._attempts else None
         judged_by = last.judged_by.value if last else ""
-        counted = self._stretch == 1
-        note = last.note if last else "no attempt was finished"
-        self.board.trial_ended(result, judged_by, note if counted else f"began at reduced speed; {note}", counted)
+        helped = any(step.intervention for attempt in self._attempts for step in attempt.steps)
+        counted = self._stretch == 1 and not helped
+        remarks = ["began at reduced speed"] * (self._stretch > 1) + ["a person helped"] * helped
+        note = "; ".join([*remarks, last.note if last else "no attempt was finished"])
+        self.board.trial_ended(result, judged_by, note, counted)
         self.recorder.end_trial(result.success, len(result.attempts))
         self.results.append(
             TrialResult(
@@ -293,6 +311,6 @@ class Session:
         for chunk in self.planner.handed_out():
             self.board.planned(chunk)
             self.recorder.add_chunk(chunk)
-        for asked in self.inbox.words():
+        for asked in self.inbox.take(CorrectFlag):
             self.lessons.correct(asked)
         self.lessons.report()

@@ -34,6 +34,8 @@ class SessionSettings:
     """Real arm: seconds for which each attempt is announced; a pause or a stop cancels it."""
     page_silence: float = math.inf
     """Real arm: seconds without a page that someone looks at after which the arm is held until Resume."""
+    no_take_over: str = ""
+    """Why a person cannot take the arm in this session; empty when one can."""
     first_stretch: int = 1
     """Real arm: ticks that each tick of the session's first attempt takes; that trial is left out of statistics."""
 
@@ -47,4 +49,4 @@ class TrialResult:
     success: bool
     judged_by: str
     counted: bool = True
-    """False for a trial that began at reduced speed."""
+    """False for a trial that began at reduced speed, or in which a person helped."""

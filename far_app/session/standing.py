@@ -16,13 +16,14 @@ from far_app.session.board import Board
 from far_app.session.publisher import RATE, TelemetryPublisher
 from far_app.session.recorder import Recorder
 from far_app.session.watched import WatchedRobot
-from far_app.session_states import Event, Happening, State, step
+from far_app.session_states import Event, Happening, Intent, State, allowed, refusal, step
 from far_app.types import Judge, Outcome
 
 log = logging.getLogger(__name__)
 
 RESTING = (State.PAUSED, State.STOPPED, State.FAULT)
-MOVING = (State.HOMING, State.RUNNING, State.ADAPTING)
+IN_ATTEMPT = (State.RUNNING, State.TAKEN_OVER)
+MOVING = (State.HOMING, *IN_ATTEMPT, State.ADAPTING)
 """States in which the arm may move."""
 
 
@@ -35,10 +36,15 @@ class Standing:
         recorder: Recorder,
         board: Board,
         publisher: TelemetryPublisher | None,
+        no_take_over: str = "",
     ) -> None:
         self.robot, self.recorder, self.board = robot, recorder, board
         self._override, self._publisher = override, publisher
         self.state = State.READY
+        self.phase = ""
+        """Of the trial: far_app/trial.py's, or "between"."""
+        self.no_take_over = no_take_over
+        """Why nobody can take over in this session."""
         self.skipping = False
         """The operator skips this trial: it ends with its running attempt."""
         self.no_lesson = False
@@ -50,6 +56,21 @@ class Standing:
     def trial_begins(self) -> None:
         self.happen(Happening.BEGIN_TRIAL)
         self.skipping, self.marked = False, None
+
+    def refusal(self, intent: Intent) -> str:
+        """Why an intent does not apply now; empty when it does."""
+        why = refusal(self.state, intent)
+        if why or intent is not Intent.TAKE_OVER:
+            return why
+        if self.no_take_over:
+            return f"'{intent}' is refused: {self.no_take_over}"
+        if self.phase not in ("attempt", "judging"):
+            return f"'{intent}' is refused while the arm goes home: only an attempt can be taken over"
+        return ""
+
+    def allowed(self) -> tuple[Intent, ...]:
+        """The intents that apply now."""
+        return tuple(intent for intent in allowed(self.state) if not self.refusal(intent))
 
     def happen(self, event: Event) -> None:
         """The state that follows."""
@@ -70,7 +91,7 @@ class Standing:
         now = time.monotonic()
         if self._publisher is not None and now - self._shown > 0.9 / RATE:
             self._shown = now
-            self._publisher.show(self.board.telemetry(self.state, self.robot.newest))
+            self._publisher.show(self.board.telemetry(self.state, self.robot.newest, self.allowed()))
 
     def rule(self, *, success: bool, note: str) -> None:
         """The operator's word on the attempt under way."""

@@ -15,7 +15,8 @@ from far_app.session.clock import TickClock
 from far_app.session.operator import Operator
 from far_app.session.planners import ThreadedPlanner
 from far_app.session.settings import Freshness
-from far_app.session.standing import MOVING, RESTING, Standing
+from far_app.session.standing import IN_ATTEMPT, MOVING, RESTING, Standing
+from far_app.session.steering import Helper
 from far_app.session_states import Happening, Intent, State
 from far_app.types import RobotMode, RobotStatus
 
@@ -34,6 +35,7 @@ class Supervision:
         *,
         standing: Standing,
         operator: Operator,
+        helper: Helper,
         planner: ThreadedPlanner,
         clock: TickClock,
         freshness: Freshness,
@@ -41,6 +43,7 @@ class Supervision:
         page_silence: float = math.inf,
     ) -> None:
         self.standing, self.operator, self.planner, self.clock = standing, operator, planner, clock
+        self.helper = helper
         self.board, self.robot, self.recorder = standing.board, standing.robot, standing.recorder
         self.freshness, self.headless = freshness, headless
         self.page_silence = page_silence
@@ -54,7 +57,8 @@ class Supervision:
         self._fetch()
         self.operator.attend(phase)
         self._notice(phase)
-        held = phase == "attempt" and self.standing.state is State.RUNNING and self._wait_while_stale()
+        held = phase == "attempt" and self.standing.state in IN_ATTEMPT and self._wait_while_stale()
+        held = self._wait_while_silent() or held
         if self.standing.state is State.PAUSED or (phase == "homing" and self.standing.state in RESTING):
             interrupted = State.ADAPTING if self.board.adapting else State.HOMING
             self.rest(phase)
@@ -99,6 +103,7 @@ class Supervision:
                 self.operator.ask(intent, "between")
                 if asked is State.AWAITING_SCENE and self.standing.state is State.READY:
                     return True
+            self.operator.listen()
             self._notice("between")
             self.rest("between")
         return False
@@ -168,9 +173,9 @@ class Supervision:
         self.board.reason = "observations are stale; the arm is held"
         self.recorder.event("stale", self.board.reason, {"age": self.robot.age()})
         self.standing.hold(self.board.reason)
-        while self.robot.age() > self.freshness.stale_after and self.standing.state is State.RUNNING:
+        while self.robot.age() > self.freshness.stale_after and self.standing.state in IN_ATTEMPT:
             self._fetch()  # a link that fell silent says so itself
-            if self.standing.state is State.RUNNING and time.monotonic() - began > self.freshness.limit:
+            if self.standing.state in IN_ATTEMPT and time.monotonic() - began > self.freshness.limit:
                 self.standing.fault(
                     f"observations were stale for {time.monotonic() - began:.1f} s (limit {self.freshness.limit:g} s), "
                     f"the newest is {self.robot.age():.2f} s old (fresh is {self.freshness.stale_after:g} s): the "
@@ -182,9 +187,29 @@ class Supervision:
             self.operator.attend("attempt")
             self._notice("attempt")
         self.clock.restart()
-        if self.standing.state is State.RUNNING:
+        if self.standing.state in IN_ATTEMPT:
             self.board.reason = ""
             self.standing.say(
                 f"observations were stale for {time.monotonic() - began:.2f} s; the arm was held", "warning"
             )
+        return True
+
+    def _wait_while_silent(self) -> bool:
+        """Hold while the source of a person's motion is silent; True when the arm was held. It goes on when the source
+        is heard again; until then the operator may do all else."""
+        silence = self.helper.silence()
+        if not silence:
+            return False
+        self.standing.hold(silence)
+        self.standing.say(f"{silence}; the arm is held", "warning")
+        self.recorder.event("take_over_silent", silence)
+        while silence := self.helper.silence():
+            self.board.reason = f"{silence}: the arm is held until it is heard again, or you hand back"
+            self.standing.show()
+            time.sleep(self.clock.period)
+            self._fetch()
+            self.operator.attend("attempt")
+            self._notice("attempt")
+        if self.standing.state in IN_ATTEMPT:
+            self.board.reason = ""
         return True

@@ -18,6 +18,8 @@ class WatchedRobot:
         self.robot = robot
         self.statistics = statistics
         self.newest: Observation | None = None
+        self.gripper = -1.0
+        """As last commanded."""
         self._asked_home = float("-inf")
 
     def refresh(self) -> Observation:
@@ -39,6 +41,7 @@ class WatchedRobot:
 
     def send(self, target: Target) -> None:
         self.statistics.sent(target.seq, target.due)
+        self.gripper = target.gripper
         self.robot.send(target)
 
     def request(self, request: Request) -> None:

@@ -38,7 +38,8 @@ class Group:
     max_attempts: int
     trials: tuple[TrialOutcome, ...]
     unfinished: int
-    """Trials that were skipped, cut off, begun at reduced speed or not yet over: in no figure."""
+    """Trials that were skipped, cut off, begun at reduced speed, helped by a person, marked unsure or not yet over: in
+    no figure."""
 
     def solved(self, attempts: int) -> list[bool]:
         return [t.solved_by is not None and t.solved_by <= attempts for t in self.trials]
@@ -92,8 +93,9 @@ def groups(sessions: Sequence[SessionRecording]) -> list[Group]:
 def ended_trials(session: SessionRecording) -> tuple[list[TrialOutcome], int]:
     """Trials that ended by themselves, under the last word on each attempt, and how many did not."""
     scenes = {e.trial: int(e.detail.get("scene_seed", 0)) for e in session.log if e.event == "trial_started"}
-    slow = {e.trial for e in session.log if e.event == "reduced_speed"}
-    over = {e.trial for e in session.log if e.event == "trial_ended"} - slow
+    apart = {e.trial for e in session.log if e.event in ("reduced_speed", "taken_over")}
+    apart |= {trial for trial, _ in session.unsure}
+    over = {e.trial for e in session.log if e.event == "trial_ended"} - apart
     limit, ended = allowed(session), []
     for trial in sorted(over & set(scenes)):
         said = {attempt: o.success for (t, attempt), o in sorted(session.marks.items()) if t == trial}

@@ -11,6 +11,7 @@ from far_app.learning.critic import Critic, CriticShape, expectile_loss, eyes_of
 from far_app.learning.critic_file import load_critic, load_demonstrations, read_card, save_critic
 from far_app.learning.critic_source import Features, Pictures, encoded
 from far_app.learning.dataset import Episode
+from far_app.learning.memory import FeatureMemory
 from far_app.learning.train_critic import CriticTraining, fit, train_critic
 from far_app.learning.transitions import Backup, EncodedEpisode, Transitions, chunked, joined, labelled, transitions
 from tests.learning.small import SIZE, small_attempt, small_policy

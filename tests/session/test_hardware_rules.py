@@ -119,7 +119,7 @@ def test_the_sessions_first_attempt_runs_slower_over_the_same_way_and_is_not_cou
     assert len(x) == 60, "twice the ticks, then the policy's own"
     np.testing.assert_allclose(np.diff(x[:40]), 0.5 * np.diff(x[40:]).mean(), rtol=1e-6)
     assert x[39] == pytest.approx(x[59], abs=1e-9), "the same way"
-    assert [row.counted for row in desk.session.board._history] == [False, True]
+    assert [row.counted for row in desk.session.board.history.trials] == [False, True]
 
 
 def test_a_way_home_that_asks_is_shown_and_answered_by_resume():

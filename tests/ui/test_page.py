@@ -15,6 +15,7 @@ from ui_stage import Stage, adapting, running, stopped
 
 from far_app.session_states import Intent, State
 from far_app.types import RobotMode
+from ui.keys import Page, keys_of
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright (the dev extra)")
 CHROMIUM = Path("/usr/bin/chromium")
@@ -130,6 +131,22 @@ def test_every_live_control_sends_its_intent(tab: Any, source: Stage, label: str
     assert wait_until(lambda: heard(source) == [intent, intent])
 
 
+@pytest.mark.parametrize(
+    ("state", "label", "key", "intent"),
+    [(State.PAUSED, "Resume", "r", Intent.RESUME), (State.AWAITING_SCENE, "Scene ready", "n", Intent.SCENE_READY)],
+)
+def test_a_control_that_waits_for_its_state_is_live_in_it(
+    tab: Any, source: Stage, state: State, label: str, key: str, intent: Intent
+) -> None:
+    assert button(tab, label).is_disabled()
+    source.telemetry = replace(running(), state=state, allowed=(Intent.STOP, intent, Intent.QUIT))
+    tab.wait_for_selector(f"button:has-text('{label}'):not(:disabled)")
+    button(tab, label).click()
+    assert wait_until(lambda: heard(source) == [intent])
+    tab.keyboard.press(key)
+    assert wait_until(lambda: heard(source) == [intent, intent])
+
+
 def test_ending_the_session_takes_a_second_click(tab: Any, source: Stage) -> None:
     button(tab, "End session").click()
     tab.wait_for_selector("button:has-text('click again')")
@@ -147,6 +164,50 @@ def test_dead_controls_are_disabled_and_say_why(tab: Any, source: Stage) -> None
     assert "Resume first" in button(tab, "Mark success").inner_text()
     button(tab, "Resume").click()
     assert wait_until(lambda: heard(source) == [Intent.RESUME])
+
+
+@pytest.mark.parametrize("state", [*State, None])
+def test_no_control_is_dead_without_a_reason(tab: Any, source: Stage, state: State | None) -> None:
+    """In every state of the session, and with no app at all."""
+    source.telemetry = None if state is None else replace(running(5), state=state, allowed=(Intent.STOP,))
+    tab.wait_for_selector("button:has-text('Pause'):disabled")
+    tab.wait_for_timeout(500)
+    labels = tab.evaluate("() => [...document.querySelectorAll('button.mantine-Button-root')].map(b => b.innerText)")
+    assert len(labels) >= 10
+    assert all(len(label.split("\n")) == 2 and label.split("\n")[1] for label in labels if label != "STOP"), labels
+
+
+def test_question_mark_shows_every_key_and_hides_them_again(tab: Any, source: Stage) -> None:
+    for typed in ("?", "Shift+?"):
+        tab.keyboard.press(typed)
+        tab.wait_for_selector("#op-keys.on")
+        shown = tab.inner_text("#op-keys")
+        assert all(key.cap in shown and key.does in shown for key in keys_of(Page.CONSOLE))
+        button(tab, "STOP").click()
+        assert wait_until(lambda: len(source.stops) >= 1), "STOP is above the list"
+        button(tab, "Keys").click()
+        tab.wait_for_selector("#op-keys:not(.on)", state="attached")
+
+
+def test_a_second_browser_only_looks_until_it_takes_control(tab: Any, browser: Any, source: Stage) -> None:
+    other = browser.new_page(viewport={"width": 1024, "height": 768})
+    other.goto(tab.url)
+    other.wait_for_selector("#op-state[data-state='RUNNING']", timeout=30_000)
+    other.wait_for_selector("button:has-text('Take control')")
+    assert button(other, "Pause").is_disabled() and "take control first" in button(other, "Pause").inner_text()
+    other.keyboard.press("p")
+    button(other, "Take control").click()
+    other.wait_for_selector("button:has-text('You have control')")
+    tab.wait_for_selector("button:has-text('Take control')")
+    assert heard(source) == []
+    button(other, "Pause").click()
+    assert wait_until(lambda: heard(source) == [Intent.PAUSE])
+    tab.wait_for_selector("button:has-text('Pause'):disabled")
+    button(tab, "STOP").click()
+    assert wait_until(lambda: len(source.stops) == 1), "STOP is everyone's"
+    button(tab, "Take control").click()
+    tab.wait_for_selector("button:has-text('You have control')")
+    other.close()
 
 
 def test_after_a_stop_resume_takes_a_click_not_a_stray_key(tab: Any, source: Stage) -> None:
@@ -220,7 +281,7 @@ def test_the_page_asks_nothing_of_the_outside(tab: Any) -> None:
     assert outside == []
 
 
-@pytest.mark.parametrize(("width", "height"), [(1280, 720), (1920, 1080), (1024, 768), (1600, 1200)])
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (1920, 1080), (1024, 768), (1600, 1200), (768, 1024)])
 def test_nothing_is_clipped_or_covered(tab: Any, source: Stage, width: int, height: int) -> None:
     source.telemetry = adapting()
     tab.set_viewport_size({"width": width, "height": height})

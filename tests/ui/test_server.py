@@ -18,11 +18,8 @@ from ui_stage import Stage, running, stopped
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from far_app.endpoints import Endpoints
-from far_app.errors import ConfigError
 from far_app.session_states import Intent
 from far_app.types import RobotMode
-from ui.page_server import open_page
-from ui.presence import Presence
 from ui.raw_client import RawClient
 from ui.stop import StopLine
 
@@ -45,12 +42,6 @@ def test_a_taken_port_is_an_error_that_names_it(folder: Path, port: int) -> None
     assert f"port {port}" in ended.stderr
     assert "--port" in ended.stderr
     assert "Traceback" not in ended.stderr
-
-
-@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.7", "example.org"])
-def test_only_loopback_is_served(host: str) -> None:
-    with pytest.raises(ConfigError, match="loopback"):
-        open_page(host, 0, Presence())
 
 
 def test_foreign_origins_are_refused_and_our_own_are_not(start_page: Start, stage: Stage) -> None:

@@ -77,6 +77,25 @@ def test_stepping_shows_each_flagged_chunk_with_frames_at_its_start_and_end(page
     at(page, FLAGGED[0])
 
 
+def click_chart(page: Any, chart: str, tick: int, last: int = 150) -> None:
+    box = page.locator(chart).bounding_box()
+    page.mouse.click(box["x"] + box["width"] * (44 + 346 * tick / last) / 400, box["y"] + box["height"] / 2)
+
+
+def test_a_click_in_either_chart_selects_the_chunk_that_begins_there(page: Any) -> None:
+    for chart, tick in (("#why-v", 100), ("#why-dv", 20), ("#why-v", 0), ("#why-dv", 50)):
+        click_chart(page, chart, tick)
+        at(page, tick)
+    page.set_viewport_size({"width": 768, "height": 1024})
+    page.wait_for_timeout(1000)
+    click_chart(page, "#why-dv", 100)
+    at(page, 100)
+    page.set_viewport_size({"width": 1280, "height": 720})
+    page.wait_for_timeout(1000)
+    click_chart(page, "#why-v", 50)
+    at(page, 50)
+
+
 def test_the_better_chunks_are_drawn_and_ranked_by_q(page: Any) -> None:
     page.wait_for_selector("#why-numbers tr.sent", timeout=SETTLED)
     gains = [float(cell) for cell in page.locator("#why-numbers tr:not(.sent) td:nth-child(3)").all_inner_texts()]

@@ -1,0 +1,206 @@
+"""Takes every picture of the pages anew, from real runs in a headless Chromium: python docs/screenshots.py [PART...]
+
+Parts: twin (a session on the twin with the shipped model), why (its recording in the attempt view), arm (the states
+that only a real arm has, on the fake controller). Writes docs/screens/*.jpg; takes about four minutes on two cores.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Error, sync_playwright
+
+ROOT = Path(__file__).resolve().parents[1]
+OUT = ROOT / "docs/screens"
+FAR = [sys.executable, "-u", "-c", "import sys; from far_app.cli import main; sys.exit(main(sys.argv[1:]))"]
+CHROMIUM = "/usr/bin/chromium"
+ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader"]
+ARGUMENTS += ["--enable-unsafe-swiftshader"]
+PATIENCE = 120_000
+"""Milliseconds for a state to come."""
+
+
+@contextlib.contextmanager
+def program(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A command of far, and the address it printed."""
+    process = subprocess.Popen([*FAR, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        yield process, next(word for word in process.stdout.readline().split() if word.startswith("http"))
+    finally:
+        process.send_signal(signal.SIGCONT)
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(timeout=30)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+class Camera:
+    """One open page and its pictures."""
+
+    def __init__(self, browser: Any, url: str, width: int = 1280, height: int = 720) -> None:
+        self.page = browser.new_page(viewport={"width": width, "height": height})
+        self.page.goto(url)
+
+    def until(self, selector: str) -> None:
+        try:
+            self.page.wait_for_selector(selector, timeout=PATIENCE)
+        except Error as error:
+            shown = self.page.inner_text(".far-head").split("\n")
+            raise SystemExit(f"{selector} never came; the page shows {shown}") from error
+
+    def state(self, word: str, more: str = "") -> None:
+        self.until(f"#op-state[data-state='{word}']{more}")
+
+    def take(self, name: str, settle: float = 0.7) -> None:
+        self.page.wait_for_timeout(1000 * settle)
+        OUT.mkdir(exist_ok=True)
+        self.page.screenshot(path=OUT / f"{name}.jpg", type="jpeg", quality=82)
+        print(f"docs/screens/{name}.jpg", flush=True)
+
+    def press(self, label: str) -> None:
+        self.page.locator(f"button:has-text('{label}'):not(:disabled)").first.click(timeout=PATIENCE)
+
+
+def twin(browser: Any, recordings: Path) -> None:
+    """A session on the twin, from its start to the loss of the page."""
+    words = ("run", "--trials", "9", "--seed", "7", "--port", "0", "--no-rerun", "--recordings", str(recordings))
+    with program(*words) as (process, url):
+        camera = Camera(browser, url)
+        camera.press("Skip trial")  # a browser that draws in software comes up in the middle of the first one
+        camera.state("GOING HOME")
+        camera.take("start", settle=0.5)
+        camera.until("#op-state[data-state='RUNNING'][data-attempt='1']")
+        camera.take("running", settle=2.5)
+        camera.page.keyboard.press("p")
+        camera.state("PAUSED")
+        camera.take("paused")
+        camera.page.keyboard.press("r")
+        failed = _failure(camera)
+        camera.take("learning", settle=1.5)
+        if not failed:
+            print("the attempt was marked a failure by hand: the shipped model had solved it", flush=True)
+        camera.until("#op-state[data-state='RUNNING'][data-attempt='2']")
+        camera.take("retry", settle=2.0)
+        camera.page.keyboard.press("Space")
+        camera.state("STOPPED")
+        camera.take("stopped")
+        camera.page.keyboard.press("?")
+        camera.until("#op-keys.on")
+        camera.take("keys")
+        camera.page.keyboard.press("?")
+        other = Camera(browser, url)
+        other.state("STOPPED")
+        other.take("viewer", settle=2.5)
+        other.page.close()
+        camera.press("Resume")
+        camera.until("#op-state[data-state='RUNNING'], #op-state[data-state='LEARNING']")
+        camera.page.set_viewport_size({"width": 768, "height": 1024})
+        camera.take("tablet_upright", settle=2.0)
+        camera.page.set_viewport_size({"width": 1024, "height": 768})
+        camera.take("tablet", settle=1.5)
+        camera.page.set_viewport_size({"width": 1280, "height": 720})
+        camera.press("Mark success")
+        camera.state("SUCCESS")
+        camera.take("success", settle=0.3)
+        process.send_signal(signal.SIGSTOP)
+        camera.state("APP SILENT")
+        camera.take("app_silent")
+        process.send_signal(signal.SIGCONT)
+        camera.until("#op-state[data-state='RUNNING']")
+        camera.press("End session")
+        camera.press("End session")
+        camera.page.wait_for_function("() => getComputedStyle(document.querySelector('#op-dead')).opacity === '1'")
+        camera.take("page_lost")
+        camera.page.close()
+
+
+def _failure(camera: Camera) -> bool:
+    """Until the first attempt has failed by itself; True when it did, or marked so where it was about to succeed."""
+    with contextlib.suppress(Error):
+        camera.page.wait_for_selector("#op-state[data-state='LEARNING']", timeout=30_000)
+        return True
+    camera.page.keyboard.press("f")
+    camera.state("LEARNING")
+    return False
+
+
+def why(browser: Any, recordings: Path) -> None:
+    """The twin's recording in the attempt view; the sample session where none was made."""
+    made = sorted(recordings.glob("*/session.json"))
+    session = made[-1].parent if made else shutil.copytree(ROOT / "recordings/sample", recordings / "sample")
+    with program("replay", str(session), "--port", "0", "--operator", "ada") as (_, url):
+        camera = Camera(browser, url)
+        camera.until("#why-numbers tr.sent")
+        camera.take("why", settle=2.0)
+        camera.page.keyboard.press("f")
+        camera.until("#why-numbers .word")
+        camera.take("why_corrected")
+        camera.page.keyboard.press("f")
+        camera.until("#why-numbers[data-flagged='1']")
+        camera.page.keyboard.press("g")
+        camera.until("#why-lesson[data-stage='']:not([data-steps='0'])")
+        camera.take("why_adapted", settle=2.0)
+        camera.page.set_viewport_size({"width": 768, "height": 1024})
+        camera.take("why_tablet", settle=2.0)
+        camera.page.close()
+
+
+def arm(browser: Any, recordings: Path) -> None:
+    """What only a real arm's session has, on the fake controller."""
+    fake = subprocess.Popen([*FAR, "fake-xarm"], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert fake.stdout is not None
+    fake.stdout.readline()
+    words = ("run", "--robot", "xarm", "--host", "127.0.0.1:15502", "--policy", "test:wander", "--no-scene3d")
+    try:
+        with program(*words, "--port", "0", "--no-rerun", "--recordings", str(recordings)) as (_, url):
+            camera = Camera(browser, url)
+            camera.state("SET THE SCENE")
+            camera.take("set_the_scene", settle=2.0)
+            camera.page.keyboard.press("n")
+            camera.until("#op-state:has-text(' in 3 s'), #op-state:has-text(' in 2 s')")
+            camera.take("countdown", settle=0.2)
+            camera.state("RUNNING")
+            subprocess.run([*FAR, "fake-xarm", "tell", "error", "31"], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+            camera.state("FAULT")
+            camera.take("fault")
+            camera.page.close()
+    finally:
+        fake.terminate()
+        fake.wait(timeout=20)
+
+
+PARTS: dict[str, Callable[[Any, Path], None]] = {"twin": twin, "why": why, "arm": arm}
+
+
+def main(parts: list[str]) -> int:
+    unknown = sorted(set(parts) - set(PARTS))
+    if unknown:
+        print(f"no part is called {', '.join(unknown)}; there are {', '.join(PARTS)}", file=sys.stderr)
+        return 2
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="far-screens-") as recordings, sync_playwright() as playwright:
+        last = Path(recordings) / "chromium"  # draws in software here: it must not take the cores from the loop
+        last.write_text(f'#!/bin/sh\nexec nice -n 15 {CHROMIUM} "$@"\n')
+        last.chmod(0o755)
+        browser = playwright.chromium.launch(executable_path=str(last), args=ARGUMENTS)
+        for part in parts or PARTS:
+            PARTS[part](browser, Path(recordings))
+        browser.close()
+    print(f"{time.monotonic() - began:.0f} s", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
