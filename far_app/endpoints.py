@@ -14,7 +14,7 @@ import zmq
 
 from far_app.errors import ConfigError
 from far_app.keys import ClientKeys, Gate, ServerKeys, client_keys
-from far_app.protocols import Heartbeat, Hold, Home, Reset, Resume
+from far_app.protocols import Guide, Heartbeat, Hold, Home, Reset, Resume
 from far_app.types import RobotStatus
 from far_app.wire import register
 
@@ -123,7 +123,7 @@ def loopback(host: str) -> bool:
 class Call:
     """A request on its way to the hw server."""
 
-    request: Home | Hold | Resume | Heartbeat | Reset
+    request: Home | Hold | Resume | Heartbeat | Reset | Guide
     expires: float
     """Monotonic seconds of the hw server; read later than this it must not act any more: it lay in a cut cable while
     the operator was told that it failed."""

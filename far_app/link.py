@@ -18,7 +18,7 @@ import zmq
 
 from far_app.endpoints import Call, Endpoints, Reply
 from far_app.errors import RobotError
-from far_app.protocols import Heartbeat, Hold, Request, Reset, Resume
+from far_app.protocols import Guide, Heartbeat, Hold, Request, Reset, Resume
 from far_app.scheduling import prompt_context
 from far_app.station import LIMIT, ClockThread, RobotClock
 from far_app.types import Ack, Observation, Target
@@ -32,6 +32,8 @@ REQUEST_TIMEOUT = 1.0
 RESET_TIMEOUT = 10.0
 RESUME_TIMEOUT = 40.0
 """A real arm is connected anew, cleared and enabled by it."""
+GUIDE_TIMEOUT = 5.0
+"""A real arm changes its mode."""
 LAST_CHANCE = 0.1
 """Seconds given to this process's own reading thread, which may have been starved too, before the robot is lost."""
 HEARTBEAT_LIFE = 0.1
@@ -179,7 +181,7 @@ class RemoteRobot:
         if isinstance(request, Heartbeat):
             self._tell(Call(request=request, expires=time.monotonic() + HEARTBEAT_LIFE))
             return
-        limit = {Reset: RESET_TIMEOUT, Resume: RESUME_TIMEOUT}.get(type(request), REQUEST_TIMEOUT)
+        limit = {Reset: RESET_TIMEOUT, Resume: RESUME_TIMEOUT, Guide: GUIDE_TIMEOUT}.get(type(request), REQUEST_TIMEOUT)
         reply = self._ask(request, limit)
         if reply.error:
             raise RobotError(reply.error)

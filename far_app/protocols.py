@@ -40,10 +40,20 @@ class Resume:
 
 @dataclass(frozen=True, kw_only=True)
 class Heartbeat:
-    """The app lives; stands for targets while homing."""
+    """The app lives; stands for targets while homing, and while a person leads the arm."""
 
 
-Request = Reset | Home | Hold | Resume | Heartbeat
+@dataclass(frozen=True, kw_only=True)
+class Guide:
+    """A person leads the arm by hand (on), or not any more. Targets are refused meanwhile, and heartbeats keep it so;
+    without them the arm is held. Refused by an arm that cannot be led."""
+
+    on: bool
+    gripper: float = -1.0
+    """−1 opens, +1 closes; may be asked for anew while it is led."""
+
+
+Request = Reset | Home | Hold | Resume | Heartbeat | Guide
 
 
 @runtime_checkable

@@ -33,6 +33,8 @@ class State(StrEnum):
     TRIAL_DONE = "trial_done"
     AWAITING_SCENE = "awaiting_scene"
     """Hardware only: held until the operator has rebuilt the scene and says the workspace is clear."""
+    REVIEWING = "reviewing"
+    """A demonstration has ended: the operator keeps it, discards it or records it again."""
     STOPPED = "stopped"
     """The operator pressed STOP; only Resume leaves."""
     FAULT = "fault"
@@ -56,6 +58,11 @@ class Intent(StrEnum):
     HAND_BACK = "hand_back"
     """The policy acts again."""
     SCENE_READY = "scene_ready"
+    KEEP = "keep"
+    """The demonstration goes to the dataset."""
+    DISCARD = "discard"
+    RECORD_AGAIN = "record_again"
+    """The demonstration is discarded and its scene recorded anew."""
     QUIT = "quit"
 
 
@@ -74,6 +81,7 @@ class Happening(StrEnum):
     FAULT = "fault"
     NO_MORE_TRIALS = "no_more_trials"
     NEED_SCENE = "need_scene"
+    NEED_REVIEW = "need_review"
     GO_ON_ATTEMPT = "go_on_attempt"
     """A held attempt goes on."""
     GO_ON_HOMING = "go_on_homing"
@@ -105,6 +113,11 @@ def _table() -> dict[tuple[State, Event], State]:
         (s.TRIAL_DONE, h.NEED_SCENE): s.AWAITING_SCENE,
         (s.TRIAL_DONE, h.NO_MORE_TRIALS): s.FINISHED,
         (s.AWAITING_SCENE, i.SCENE_READY): s.READY,
+        (s.TRIAL_DONE, h.NEED_REVIEW): s.REVIEWING,
+        (s.READY, h.NEED_REVIEW): s.REVIEWING,  # after a stop
+        (s.REVIEWING, i.KEEP): s.TRIAL_DONE,
+        (s.REVIEWING, i.DISCARD): s.TRIAL_DONE,
+        (s.REVIEWING, i.RECORD_AGAIN): s.TRIAL_DONE,
         # the operator's word on the attempt; what follows is a happening of the same tick
         (s.RUNNING, i.MARK_SUCCESS): s.RUNNING,
         (s.RUNNING, i.MARK_FAILURE): s.RUNNING,
@@ -169,6 +182,9 @@ _WHY: dict[Intent, str] = {
     Intent.TAKE_OVER: "only an attempt under way can be taken over",
     Intent.HAND_BACK: "nobody has taken over",
     Intent.SCENE_READY: "the app does not wait for a scene",
+    Intent.KEEP: "no demonstration waits for your word",
+    Intent.DISCARD: "no demonstration waits for your word",
+    Intent.RECORD_AGAIN: "no demonstration waits for your word",
     Intent.QUIT: "the session has ended",
 }
 

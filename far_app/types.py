@@ -40,6 +40,8 @@ class RobotMode(StrEnum):
     """Following targets."""
     HOMING = "homing"
     """Opening, retreating and going to the start pose; targets are refused, heartbeats keep it alive."""
+    GUIDED = "guided"
+    """A person leads it by hand; targets are refused, heartbeats keep it so."""
     LATCHED = "latched"
     """Still after STOP or a fault; everything but Resume is refused."""
 

@@ -44,7 +44,8 @@ def register(cls: _T) -> _T:
 for _cls in (
     types.Pose, types.RobotStatus, types.Target, types.Ack, types.Observation, types.ActionChunk, types.Outcome,
     types.RobotMode, types.Judge, types.AdaptationStep, types.Adaptation, types.Contrast, types.FlagCorrection,
-    protocols.Reset, protocols.Home, protocols.Hold, protocols.Resume, protocols.Heartbeat, protocols.Frame,
+    protocols.Reset, protocols.Home, protocols.Hold, protocols.Resume, protocols.Heartbeat, protocols.Guide,
+    protocols.Frame,
     DeviceInput,
 ):  # fmt: skip
     register(_cls)

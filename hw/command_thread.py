@@ -13,7 +13,7 @@ import zmq
 
 from far_app.endpoints import Call, Endpoints, Reply
 from far_app.errors import RobotError
-from far_app.protocols import Heartbeat, Hold, Home, Reset, Resume
+from far_app.protocols import Guide, Heartbeat, Hold, Home, Reset, Resume
 from far_app.scheduling import MESSAGE_PRIORITY, real_time
 from far_app.station import ClockAnswer, ClockQuery, Station
 from far_app.telemetry import GeometryRequest, SceneGeometry
@@ -109,12 +109,15 @@ class CommandThread:
         if math.isfinite(lead):
             self._servo.shift_pictures(self._timing.shift(lead))
 
-    def _request(self, address: list[bytes], request: Home | Hold | Resume | Heartbeat | Reset) -> None:
+    def _request(self, address: list[bytes], request: Home | Hold | Resume | Heartbeat | Reset | Guide) -> None:
         if isinstance(request, Reset):
             self._pending.append((self._servo.reset(request.seed), address))
             return
         if isinstance(request, Resume) and self._latched():
             self._pending.append((self._servo.resume(), address))
+            return
+        if isinstance(request, Guide):
+            self._pending.append((self._servo.guide(request), address))
             return
         if isinstance(request, Hold) and request.latch:
             self._servo.halt()

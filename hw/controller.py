@@ -6,6 +6,7 @@
     tick(measured)   once a servo period: the pose and gripper for the arm, always through hw/safety.py
 
     HOLD ──target──▶ TRACKING ──100 ms without one──▶ HOLD          any ──STOP, fault──▶ LATCHED ──Resume──▶ HOLD
+    HOLD, TRACKING ──Guide──▶ GUIDED (led by hand) ──Guide off, no heartbeat──▶ HOLD
     HOLD, TRACKING ──Home──▶ HOMING ──home and settled──▶ HOLD      HOMING without heartbeats stands still
 
 Motion after any hold starts from the measured pose. The same controller serves the twin (120 Hz) and a real arm.
@@ -21,7 +22,7 @@ import numpy as np
 
 from far_app.config import TaskConfig
 from far_app.errors import RobotError
-from far_app.protocols import Heartbeat, Hold, Home, Reset, Resume
+from far_app.protocols import Guide, Heartbeat, Hold, Home, Reset, Resume
 from far_app.types import Ack, Pose, RobotMode, RobotStatus, Target
 from hw.homing import Homing, Phase
 from hw.plant import Measured
@@ -74,6 +75,8 @@ class ArmController:
         """Admit a target or say why not; either way its acknowledgment is due."""
         if self.mode is RobotMode.LATCHED or self._stop_reason:
             return self._refuse(target, now, f"the arm is latched ({self.reason or self._stop_reason}); resume first")
+        if self.mode is RobotMode.GUIDED:
+            return self._refuse(target, now, "the arm is led by hand; end that first")
         if self.mode is RobotMode.HOMING:
             return self._refuse(target, now, "the arm is going home; targets are taken again when it is there")
         if self.measured.age > STALE:
@@ -92,7 +95,7 @@ class ArmController:
         self.clips += verdict.clipped
         return self._acknowledge(target, now, verdict.pose, self._grip, clipped=verdict.clipped)
 
-    def request(self, request: Home | Hold | Resume | Heartbeat | Reset, now: float) -> None:
+    def request(self, request: Home | Hold | Resume | Heartbeat | Reset | Guide, now: float) -> None:
         """Change the mode, or raise RobotError saying why not. (Reset is the plant's owner's affair.)"""
         if isinstance(request, Heartbeat):
             self._heartbeat(now)
@@ -104,6 +107,8 @@ class ArmController:
             elif self.mode is not RobotMode.LATCHED:
                 self._hold(request.reason)
                 self._homing = None
+        elif isinstance(request, Guide):
+            self._guide(request, now)
         elif isinstance(request, Home):
             self.refuse_latched("Home")
             self._go_home(now)
@@ -114,6 +119,13 @@ class ArmController:
         """Raise RobotError while the arm is latched."""
         if self.mode is RobotMode.LATCHED or self._stop_reason:
             raise RobotError(f"{what} refused: the arm is latched ({self.reason or self._stop_reason}); resume first")
+
+    def refuse_guiding(self, request: Guide) -> None:
+        """Raise RobotError where nobody may lead the arm by hand now."""
+        if request.on:
+            self.refuse_latched("Guide")
+            if self.mode is RobotMode.HOMING:
+                raise RobotError("Guide refused: the arm is going home; it can be led by hand when it is there")
 
     def refuse_unlatching(self) -> None:
         """Raise RobotError while a STOP is under way."""
@@ -165,6 +177,11 @@ class ArmController:
                 command = Follow()
         elif self.mode is RobotMode.HOMING:
             command = self._homing_command(measured, silent or stale)
+        elif self.mode is RobotMode.GUIDED:
+            self._anchor()
+            if silent or stale:
+                self.holds += 1
+                self._hold("led by hand, and the app or the arm fell silent: it is held")
         if measured.stalled:
             self._start_anew()
         verdict = safety_filter(self._state, command, self.rig.safety, now)
@@ -266,17 +283,27 @@ class ArmController:
             self._hold("resumed by the operator")
             self.fault, self._at_home = False, False
 
+    def _guide(self, request: Guide, now: float) -> None:
+        self.refuse_guiding(request)
+        if request.on:
+            self.mode, self.reason, self._last_fresh = RobotMode.GUIDED, "led by hand", now
+            self._grip = float(np.clip(request.gripper, -1.0, 1.0))
+            self._at_home, self._homing = False, None
+            self._anchor()
+        elif self.mode is RobotMode.GUIDED:
+            self._hold("no longer led by hand")
+
     def _go_home(self, now: float) -> None:
         homing = Homing(self.rig, self.task, self.measured, self._grip)
         if homing.failed:
             raise RobotError(f"Home refused: {homing.failed}")
-        if self.mode is RobotMode.HOLD:
+        if self.mode in (RobotMode.HOLD, RobotMode.GUIDED):
             self._anchor()
         self._homing, self._at_home, self._silent, self._last_seq = homing, False, False, -1
         self.mode, self.reason, self._last_fresh = RobotMode.HOMING, homing.waiting, now
 
     def _heartbeat(self, now: float) -> None:
-        if self.mode is RobotMode.HOMING:
+        if self.mode in (RobotMode.HOMING, RobotMode.GUIDED):
             self._last_fresh = now
 
     def _refuse(self, target: Target, now: float, reason: str) -> Ack:

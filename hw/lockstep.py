@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from far_app.config import TaskConfig
 from far_app.errors import RobotError
-from far_app.protocols import Home, Request, Reset, Resume
+from far_app.protocols import Guide, Home, Request, Reset, Resume
 from far_app.types import Observation, RobotMode, Target
 from hw.controller import ArmController
 from hw.observing import observation
@@ -80,6 +80,8 @@ class LockstepRobot:
             self.controller.refuse_latched("Reset")
             self.plant.reset(request.seed)
             self.controller.reset(self.plant.measure(), request.seed)
+        elif isinstance(request, Guide) and request.on:
+            self.plant.guide(True)
         else:
             self.controller.request(request, self.now)
         self._observation = None

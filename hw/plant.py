@@ -68,6 +68,14 @@ class Plant(Protocol):
         moving. May block for seconds; raises RobotError saying what is still wrong. Twin: no-op."""
         ...
 
+    guided: bool
+    """A person may lead the arm by hand: it is compliant, and `servo` moves its gripper alone."""
+
+    def guide(self, on: bool) -> None:
+        """Make the arm compliant, or stiff again where it stands. May block for a second; raises RobotError where it
+        cannot. The twin never can."""
+        ...
+
     def close(self) -> None:
         """Let go of the arm."""
         ...

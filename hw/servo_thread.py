@@ -17,9 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from far_app.errors import FarError
-from far_app.protocols import Resume
+from far_app.errors import FarError, RobotError
+from far_app.protocols import Guide, Resume
 from far_app.scheduling import SERVO_NICENESS, SERVO_PRIORITY, real_time
+from far_app.types import RobotMode
 from hw.cameras import Moment
 from hw.controller import ArmController
 from hw.plant import Measured, Plant
@@ -116,6 +117,22 @@ class ServoThread:
 
         return self.call(work)
 
+    def guide(self, request: Guide) -> Future[None]:
+        """Make the arm compliant for a person's hands, or tell its gripper meanwhile; off holds it where it is, and it
+        is made stiff before the next command."""
+
+        def work() -> None:
+            with self._lock:
+                self._controller.refuse_guiding(request)
+            if request.on and not self._plant.guided:
+                self._plant.guide(True)
+            measured = self._plant.measure()
+            with self._lock:
+                self._controller.measured = measured
+                self._controller.request(request, time.monotonic())
+
+        return self.call(work)
+
     def shift_pictures(self, ticks: int) -> None:
         """Take the next snapshot so many servo ticks later or earlier, and all after it at the usual distance."""
         self._next_picture += ticks
@@ -172,6 +189,9 @@ class ServoThread:
         measured = self._plant.measure()
         with self._lock:
             pose, gripper = self._controller.tick(now, measured)
+            led = self._controller.mode is RobotMode.GUIDED
+        if self._plant.guided and not led:
+            self._stiffen()
         self._plant.servo(pose, gripper)
         self._plant.advance()
         moment, snap = self.newest.moment, self.ticks >= self._next_picture
@@ -182,6 +202,14 @@ class ServoThread:
             self._next_picture = self.ticks + self._per_picture
             with self._snapped:
                 self._snapped.notify_all()
+
+    def _stiffen(self) -> None:
+        """The arm is no longer led by hand: it is commanded again, from where it stands."""
+        try:
+            self._plant.guide(False)
+        except RobotError as error:
+            with self._lock:
+                self._controller.fail(f"the arm could not be made stiff again: {error}")
 
     def _answer_calls(self) -> None:
         while not self._calls.empty():

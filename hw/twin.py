@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from far_app.config import TaskConfig
+from far_app.errors import RobotError
 from far_app.motion import quat_inverse, quat_multiply
 from far_app.types import Pose
 from hw.osc import OperationalSpace
@@ -85,6 +86,7 @@ class TwinPlant:
     """A Plant (hw/plant.py) in simulated time: `advance` is what lets time pass."""
 
     servo_hz = SERVO_HZ
+    guided = False
 
     def __init__(self, rig: RigConfig, task: TaskConfig) -> None:
         self.rig, self.task = rig, task
@@ -206,6 +208,10 @@ class TwinPlant:
             self._task_check = (bool(self.env._check_success()), float(self.env.reward(None)))
 
     def halt(self) -> None: ...
+
+    def guide(self, on: bool) -> None:
+        if on:
+            raise RobotError("the twin cannot be led by hand: steer it (--teleop), or give --robot xarm")
 
     def rearm(self) -> None: ...
 

@@ -19,6 +19,7 @@ from far_app.session_states import Intent, State
 from far_app.telemetry import Telemetry, View
 from far_app.types import RobotMode
 from ui import html
+from ui.demonstration import Demonstration
 from ui.keys import Page, add_hotkey, hint, key_of
 from ui.lineage import Lineage
 from ui.marks import Marks
@@ -146,9 +147,8 @@ class Console:
 
     def _add_panels(self) -> Panels:
         marks = Marks()
-        panels = Panels(
-            self._gui, self._presses, self._latest, self.pressed.put, self.refuse, (TakeOver(), marks, Lineage())
-        )  # fmt: skip
+        every = (TakeOver(), marks, Lineage(), Demonstration())
+        panels = Panels(self._gui, self._presses, self._latest, self.pressed.put, self.refuse, every)
         marks.add_field(self._gui, self._presses, panels)
         return panels
 

@@ -106,7 +106,7 @@ class Panels:
             f'div:has(> [id="{uuid}"]) {{ left: calc(var(--panel-left) + {left} * var(--u)); '
             f"top: calc(var(--panel-top) + {top} * var(--u)); width: calc({width} * var(--u)); "
             f"height: calc({height} * var(--u)); z-index: 31 !important; }} "
-            f'body:not(:has(#far-tab-{panel}[open])) div:has(> [id="{uuid}"]) {{ display: none; }}'
+            f'{closed(panel)} div:has(> [id="{uuid}"]) {{ display: none; }}'
         )
 
     def place_before(self, panel: str, mark: str, box: Box) -> None:
@@ -116,7 +116,7 @@ class Panels:
             f"div:has(> .{mark}) + div {{ left: calc(var(--panel-left) + {left} * var(--u)); "
             f"top: calc(var(--panel-top) + {top} * var(--u)); width: calc({width} * var(--u)); "
             f"height: calc({height} * var(--u)); z-index: 31 !important; }} "
-            f"body:not(:has(#far-tab-{panel}[open])) div:has(> .{mark}) + div {{ display: none; }}"
+            f"{closed(panel)} div:has(> .{mark}) + div {{ display: none; }}"
         )
 
     @property
@@ -163,5 +163,18 @@ def _frame_place(panel: Panel) -> str:
     return (
         f"div:has(> .panel-{panel.name}) {{ left: var(--panel-left); top: var(--panel-top); "
         f"width: calc(33 * var(--u)); height: calc({panel.height} * var(--u)); z-index: 30 !important; }} "
-        f"body:not(:has(#far-tab-{panel.name}[open])) div:has(> .panel-{panel.name}) {{ display: none; }}"
+        f"{closed(panel.name)} div:has(> .panel-{panel.name}) {{ display: none; }}"
     )
+
+
+OPENS_IN = {"demo": "KEEP IT?", "steer": "TAKEN OVER"}
+"""Panel to the state in which it opens by itself."""
+
+
+def closed(panel: str) -> str:
+    """The selector of a page in which this panel is not to be seen: its tab is closed, and it does not open by itself,
+    which an open tab of another prevents."""
+    tab = f"body:not(:has(#far-tab-{panel}[open]))"
+    if panel not in OPENS_IN:
+        return tab
+    return f'{tab}:is(:not(:has(#op-state[data-state="{OPENS_IN[panel]}"])), :has(.far-tabs details[open]))'

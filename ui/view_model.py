@@ -70,6 +70,7 @@ WORDS: dict[State, tuple[str, Tone]] = {
     State.ADAPTING: ("LEARNING", Tone.LEARN),
     State.TRIAL_DONE: ("TRIAL DONE", Tone.IDLE),
     State.AWAITING_SCENE: ("SET THE SCENE", Tone.WARN),
+    State.REVIEWING: ("KEEP IT?", Tone.WARN),
     State.STOPPED: ("STOPPED", Tone.BAD),
     State.FAULT: ("FAULT", Tone.BAD),
     State.FINISHED: ("FINISHED", Tone.IDLE),
@@ -128,6 +129,7 @@ def _detail(telemetry: Telemetry) -> str:
         State.PAUSED: "Held by the operator; Resume goes on.",
         State.TRIAL_DONE: f"{home.capitalize()}." if 0 < t.homing_progress < 1 else "The next trial follows.",
         State.AWAITING_SCENE: "Rebuild the scene, clear the workspace, then press Scene ready.",
+        State.REVIEWING: "Keep the demonstration, discard it, or record it again.",
         State.STOPPED: "The arm is latched; Resume when it is safe to move.",
         State.FAULT: "The arm is held; Resume clears the fault when its cause is gone.",
         State.FINISHED: "All trials are done.",
@@ -143,6 +145,7 @@ class Control:
 
 
 _ATTEMPT_ONLY = "only during an attempt"
+_NO_DEMO = "no demonstration waits"
 _REASONS: dict[Intent, str] = {
     Intent.PAUSE: "nothing is running",
     Intent.RESUME: "nothing is held",
@@ -152,6 +155,9 @@ _REASONS: dict[Intent, str] = {
     Intent.TAKE_OVER: _ATTEMPT_ONLY,
     Intent.HAND_BACK: "the policy has the arm",
     Intent.SCENE_READY: "no scene is awaited",
+    Intent.KEEP: _NO_DEMO,
+    Intent.DISCARD: _NO_DEMO,
+    Intent.RECORD_AGAIN: _NO_DEMO,
     Intent.QUIT: "already finished",
 }
 
@@ -282,12 +288,14 @@ def arm_word(status: RobotStatus | None, person: bool = False) -> tuple[str, Ton
         RobotMode.HOLD: Tone.IDLE,
         RobotMode.TRACKING: Tone.RUN,
         RobotMode.HOMING: Tone.RUN,
+        RobotMode.GUIDED: Tone.LEARN,
         RobotMode.LATCHED: Tone.BAD,
     }[status.mode]
     words = {
         RobotMode.HOLD: "arm holds",
         RobotMode.TRACKING: "arm follows a person" if person else "arm follows the policy",
         RobotMode.HOMING: f"arm goes home, {100 * status.homing_progress:.0f} %",
+        RobotMode.GUIDED: "arm is led by hand",
         RobotMode.LATCHED: "arm latched",
     }[status.mode]
     return words, tone

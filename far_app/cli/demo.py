@@ -1,4 +1,5 @@
-"""`far demo`: demonstrations by the scripted expert, in lockstep with the twin, appended to an HDF5 file.
+"""`far demo`: demonstrations by the scripted expert, in lockstep with the twin, appended to an HDF5 file; by a person
+with --teleop or --by-hand (demo_person.py).
 
 With --policy it records a policy's own attempts instead, whatever their outcome: what a critic learns failure from.
 """
@@ -11,6 +12,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -19,6 +21,7 @@ from tqdm import tqdm
 from far_app.cli.lockstep_twin import LANES, lockstep_twins, origin, trials
 from far_app.config import TaskConfig
 from far_app.demonstrations import SEED_OFFSET, demonstrate
+from far_app.errors import ConfigError
 from far_app.learning.dataset import check_origin, count_episodes, episode_of, last_scene, seen_and_done, write_episode
 from far_app.tasks import task as find_task
 from far_app.types import Observation
@@ -38,7 +41,7 @@ class DemoOptions:
     seed: int = 0
     """Demonstration scenes are numbered from here; they never coincide with reporting scenes."""
     out: Path | None = None
-    """HDF5 file; datasets/TASK.hdf5 by default."""
+    """HDF5 file; datasets/TASK.hdf5 by default, datasets/TASK.person.hdf5 for a person's."""
     policy: Path | None = None
     """Record this policy's attempts instead of the expert's demonstrations."""
     explore: float = 0.0
@@ -46,20 +49,36 @@ class DemoOptions:
     from them what other actions would have led to."""
     linger: int = 0
     """Ticks to go on after a success: a success detector learns from them what success looks like."""
-    rig: str = "twin"
+    teleop: bool = False
+    """You demonstrate: steer the arm from the page, or with the SpaceMouse or gamepad of the rig."""
+    by_hand: bool = False
+    """You demonstrate: lead a real xArm7 with your hands."""
+    robot: Literal["twin", "xarm"] | None = None
+    """With --teleop or --by-hand: which arm; the rig file's own when it is not given."""
+    host: str = ""
+    """ADDRESS[:PORT] of a real arm's controller."""
+    port: int = 8080
+    """The page's, for --teleop and --by-hand."""
+    recordings: Path = Path("recordings")
+    """All that you demonstrate is recorded here as a session, kept or not."""
+    rig: str | None = None
+    """The twin by default; xarm7 with --robot xarm."""
     images: bool = True
     """Draw the cameras; a policy of the `state` preset needs none."""
 
 
 def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(DemoOptions, args=list(arguments), prog="far demo")
-    rig = load_rig(options.rig, options.task)
+    if options.teleop or options.by_hand:
+        return by_a_person(options)
+    name = options.rig or "twin"
+    rig = load_rig(name, options.task)
     task = find_task(options.task, rig.arm)
     task = dataclasses.replace(task, success_ticks=task.success_ticks + options.linger)
     path = options.out or Path("datasets") / f"{task.name}.hdf5"
     env_args = origin(task, rig)
     check_origin(path, env_args)
-    robots = lockstep_twins(options.rig, task, LANES if options.policy is not None else 1, options.images)
+    robots = lockstep_twins(name, task, LANES if options.policy is not None else 1, options.images)
     first = SEED_OFFSET + options.seed + last_scene(path)
     if options.policy is not None:
         recorded = policy_attempts(options.policy, task, robots, options.explore, first)
@@ -75,6 +94,24 @@ def main(arguments: Sequence[str]) -> int:
                 there += 1
                 bar.update()
     log.info("%s holds %d episodes; %d attempts failed", path, options.n, failures)
+    return 0
+
+
+def by_a_person(options: DemoOptions) -> int:
+    """--teleop, --by-hand."""
+    from far_app.cli.demo_person import record
+    from far_app.cli.options import RunOptions
+
+    if options.teleop and options.by_hand:
+        raise ConfigError("--teleop and --by-hand exclude each other: the arm is steered, or led by hand")
+    if options.policy is not None:
+        raise ConfigError("--policy records a policy's attempts; a person's demonstrations (--teleop) have none")
+    run = RunOptions(
+        task=options.task, robot=options.robot, rig=options.rig, host=options.host, port=options.port,
+        recordings=options.recordings, judge_wait=600.0,
+    )  # fmt: skip
+    path, held = record(run, "hand" if options.by_hand else "teleop", options.n, options.seed, options.out)
+    print(f"{path} holds {held} demonstrations: far train policy --data {path}")
     return 0
 
 

@@ -16,8 +16,9 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from far_app.cli._person import person_parts
 from far_app.cli.agreement import agreed
 from far_app.cli.assemble import Parts, assemble, check_observation
 from far_app.cli.detector import failure_alarm, learned_detector
@@ -39,6 +40,7 @@ from far_app.session.planners import ThreadedPlanner, plan_one
 from far_app.session.publisher import TelemetryPublisher
 from far_app.session.realtime import prepare_process
 from far_app.session.recorder import Recorder
+from far_app.session.review import Keep, drop
 from far_app.session.session import Session
 from far_app.session.settings import SessionSettings
 from far_app.session.shadow import ShadowRobot
@@ -58,6 +60,7 @@ COUNTDOWN = 3.0
 """Seconds for which a real arm's attempts are announced."""
 PAGE_SILENCE = 2.0
 """Seconds without a page that someone looks at after which a real arm is held."""
+NO_TAKE_OVER = "the arm is held in a shadow run"
 FIRST_STRETCH = 2
 """Ticks that each tick of a session's first attempt takes on a real arm."""
 
@@ -115,9 +118,11 @@ class Stage:
 
     @contextlib.contextmanager
     def session(
-        self, writer: SessionWriter, inbox: IntentInbox, statistics: LoopStatistics, method: Method | None = None
-    ) -> Iterator[Session]:
-        """A session on this stage, with the page told about it and revived when it dies."""
+        self, writer: SessionWriter, inbox: IntentInbox, statistics: LoopStatistics, method: Method | None = None, *,
+        demonstrate: Literal["", "teleop", "hand"] = "", keep: Keep = drop,
+    ) -> Iterator[Session]:  # fmt: skip
+        """A session on this stage, with the page told about it and revived when it dies; of attempts, or of a person's
+        demonstrations."""
         options = self.options
         publisher = None
         if options.rerun:
@@ -130,12 +135,13 @@ class Stage:
                 session = Session(
                     settings=SessionSettings(
                         name=writer.folder.name, trials=options.trials, seed=options.seed, headless=options.headless,
-                        adaptation_limit=options.retry.adaptation_limit, **self._hardware_rules(),
+                        adaptation_limit=options.retry.adaptation_limit, demonstrate=demonstrate,
+                        no_take_over=NO_TAKE_OVER if options.shadow else "", **self._hardware_rules(),
                     ),
                     robot=robot, planner=ThreadedPlanner(), method=method or self.parts.method,
                     detector=detector, task=self.task, scale=self.rig.scale_for(self.task),
                     recorder=Recorder(writer), inbox=inbox, statistics=statistics, publisher=publisher,
-                    alarm=failure_alarm(options),
+                    alarm=failure_alarm(options), keep=keep,
                 )  # fmt: skip
                 if options.shadow:
                     session.standing.say("shadow run: plans are shown, the arm is held", "warning")
@@ -146,8 +152,9 @@ class Stage:
 
 
 @contextlib.contextmanager
-def stage(options: RunOptions) -> Iterator[Stage]:
-    """Start everything, wait until it is ready, end everything. Raises the FarError of whatever cannot start."""
+def stage(options: RunOptions, person: bool = False) -> Iterator[Stage]:
+    """Start everything, wait until it is ready, end everything. `person`: nobody else acts, no policy is loaded. Raises
+    the FarError of whatever cannot start."""
     rig = options.load_rig()
     task = with_views(find_task(options.task, rig.arm), rig.cameras)
     task = task if rig.robot == "twin" else supervised(task)
@@ -158,7 +165,7 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         stack.callback(family.end)
         hardware, rig = find_hardware(folder, family, options, rig)
         page = None if options.headless else family.add(start_page(folder, options, port, task.cameras))
-        parts = assemble(
+        parts = person_parts(task, rig.policy_image) if person else assemble(
             options.method, task, options.policy, options.critic, options.device, options.retry, options.engine,
             threads=options.torch_threads,
         )  # fmt: skip
@@ -172,10 +179,11 @@ def stage(options: RunOptions) -> Iterator[Stage]:
         if page is not None:
             wait_for_page(page, options.page_host, port)
         check_observation(parts.method.policy.spec, robot.observe())
-        preflight(
-            parts.method.policy.spec, policy_card(task.name, options.policy), setup_of(rig, task), robot.observe(),
-            options.accept_differences or options.shadow,
-        )  # fmt: skip
+        if not person:
+            preflight(
+                parts.method.policy.spec, policy_card(task.name, options.policy), setup_of(rig, task), robot.observe(),
+                options.accept_differences or options.shadow,
+            )  # fmt: skip
         prepare_process(options.torch_threads)
         warm_up(parts.method.policy, robot)
         yield Stage(

@@ -34,6 +34,9 @@ class History:
     def has(self, trial: int, attempt: int) -> bool:
         return (trial, attempt) in self._attempts
 
+    def of(self, trial: int, attempt: int) -> Judged | None:
+        return self._attempts.get((trial, attempt))
+
     def attempt_ended(self, trial: int, attempt: Attempt) -> None:
         key, outcome = (trial, attempt.index), attempt.outcome
         self._attempts[key] = Judged(

@@ -38,12 +38,12 @@ class Operator:
 
     def attend(self, phase: str) -> None:
         """Do what was asked since the last call. `phase`: of the trial, far_app/trial.py's or "between"."""
-        self.standing.phase = phase
         for intent in self.inbox.drain():
             self.ask(intent, phase)
         pressed = self.helper.pressed()
         if pressed is not None:
             self.ask(pressed, phase, Source.DEVICE)
+        self.standing.phase = phase
         self.listen()
 
     def listen(self) -> None:
@@ -57,6 +57,7 @@ class Operator:
 
     def ask(self, intent: Intent, phase: str, source: Source = Source.PAGE) -> None:
         """Refuse an intent with a reason, or obey it."""
+        self.standing.phase = phase
         why = self.standing.refusal(intent)
         self.board.refusal = why
         if why:

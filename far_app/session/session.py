@@ -16,6 +16,7 @@ from far_app.alarm import Alarm
 from far_app.config import TaskConfig
 from far_app.detectors import OperatorOverride
 from far_app.errors import RobotError
+from far_app.guided import guided_trial
 from far_app.motion import ActionScale
 from far_app.protocols import EngineReport, Hold, Method, PlanRequest, Robot, RunsOnEngine, SuccessDetector
 from far_app.scheduling import LOOP_PRIORITY, real_time_inside
@@ -29,6 +30,7 @@ from far_app.session.planners import ThreadedPlanner
 from far_app.session.publisher import TelemetryPublisher
 from far_app.session.realtime import collect_between, collector_off
 from far_app.session.recorder import Recorder
+from far_app.session.review import Keep, Review, drop
 from far_app.session.settings import SessionSettings, TrialResult
 from far_app.session.standing import IN_ATTEMPT, Standing
 from far_app.session.statistics import LoopStatistics
@@ -36,7 +38,7 @@ from far_app.session.steering import Helper
 from far_app.session.supervision import Supervision, TrialAbandoned
 from far_app.session.versions import VersionKeeper
 from far_app.session.watched import WatchedRobot
-from far_app.session_states import Happening, State
+from far_app.session_states import Happening, Intent, State
 from far_app.trial import (
     NO_ALARM,
     Adapted,
@@ -45,6 +47,7 @@ from far_app.trial import (
     AttemptStarted,
     Event,
     Tick,
+    TrialEvents,
     trial,
 )
 from far_app.types import Attempt, Step, Trial
@@ -69,7 +72,9 @@ class Session:
         statistics: LoopStatistics,
         publisher: TelemetryPublisher | None = None,
         alarm: Alarm = NO_ALARM,
+        keep: Keep = drop,
     ) -> None:
+        """`keep` takes a demonstration that the operator keeps."""
         self.settings, self.task, self.scale, self.alarm = settings, task, scale, alarm
         self.planner, self.method, self.recorder, self.statistics = planner, method, recorder, statistics
         self.robot = WatchedRobot(robot, statistics)
@@ -81,8 +86,8 @@ class Session:
         )  # fmt: skip
         self.standing = Standing(
             robot=self.robot, override=self.detector, recorder=recorder, board=self.board, publisher=publisher,
-            no_take_over=settings.no_take_over,
         )  # fmt: skip
+        self.standing.withheld[Intent.TAKE_OVER] = settings.no_take_over
         self.helper = Helper(self.standing, inbox, scale)
         marking = Marking(self.standing, settings.name)
         self.versions = VersionKeeper(self.standing, method, recorder.folder)
@@ -95,6 +100,9 @@ class Session:
             freshness=settings.freshness, headless=settings.headless, page_silence=settings.page_silence,
         )  # fmt: skip
         self.lessons = Lessons(self.standing, self.versions, session=settings.name, limit=settings.adaptation_limit)
+        self.review = Review(self.standing, self.supervision, self.operator, keep)
+        if settings.demonstrate:
+            self.standing.withheld[Intent.HAND_BACK] = "a demonstration has no policy to hand back to"
         self.results: list[TrialResult] = []
         self.last_failure: Attempt | None = None
         """The newest failed attempt."""
@@ -108,22 +116,35 @@ class Session:
 
     def run(self) -> list[TrialResult]:
         """All trials, or until the operator quits. Raises SessionFault (headless), RecordingError and RobotError."""
-        number = 0
+        number = done = 0
+        scene = self.settings.seed
         try:
             with real_time_inside(LOOP_PRIORITY) as scheduling, collector_off():
                 log.info("the loop is scheduled %s", scheduling)
                 self.robot.refresh()
                 while self._between_trials():
-                    if self.settings.trials and number == self.settings.trials:
+                    if self.settings.trials and done == self.settings.trials:
                         self.standing.happen(Happening.NO_MORE_TRIALS)
                         break
                     if self.settings.await_scene and not self.supervision.await_scene():
                         break
                     number += 1
-                    self._run_trial(number, self.settings.seed + number - 1)
+                    self._run_trial(number, scene)
+                    word = self._reviewed(done) if self.settings.demonstrate else Intent.KEEP
+                    done += word is Intent.KEEP
+                    scene += word is not Intent.RECORD_AGAIN
         finally:
             self._finish()
         return self.results
+
+    def _reviewed(self, kept: int) -> Intent:
+        """The operator's word on the demonstration that has just ended; one that was cut off is discarded."""
+        if self.standing.state is State.FINISHED or not self._attempts:
+            return Intent.DISCARD
+        try:
+            return self.review.ask(self._attempts[-1], kept, self.settings.trials)
+        except TrialAbandoned:
+            return Intent.DISCARD
 
     def _between_trials(self) -> bool:
         """Wait out a stop or a fault; False when the session has ended."""
@@ -144,10 +165,7 @@ class Session:
         self.recorder.begin_trial(number, seed)
         self.standing.say(f"trial {number}: scene {seed}")
         self._stretch = self.settings.first_stretch if number == 1 else 1
-        events = trial(
-            seed, self.robot, self.planner, self.method, self.detector, self.task, self.scale, self.lessons.start,
-            self._stretch, self.alarm, self.helper,
-        )  # fmt: skip
+        events = self._events(seed)
         answer: float | None = None
         try:
             while True:
@@ -160,6 +178,15 @@ class Session:
             events.close()
             self.lessons.end()
             self._account()
+
+    def _events(self, seed: int) -> TrialEvents:
+        """What happens on this scene: Algorithm 1, or a person leading the arm by hand."""
+        if self.settings.demonstrate == "hand":
+            return guided_trial(seed, self.robot, self.detector, self.task, self.scale, self.helper)
+        return trial(
+            seed, self.robot, self.planner, self.method, self.detector, self.task, self.scale, self.lessons.start,
+            self._stretch, self.alarm, self.helper,
+        )  # fmt: skip
 
     def _answer(self, event: Event) -> float | None:
         """What the trial's event asks of a driver in real time."""
@@ -189,7 +216,8 @@ class Session:
         due = self.clock.wait()
         held = self.supervision.attend(tick.phase)
         if held and tick.phase == "attempt" and self.standing.state in IN_ATTEMPT:
-            self._prime()
+            if self.settings.demonstrate != "hand":
+                self._prime()
             self.clock.restart()
             due = AfterHold(self.clock.wait())
             self.supervision.attend(tick.phase)
@@ -213,7 +241,10 @@ class Session:
             self.recorder.event("reduced_speed", pace.strip(), {"stretch": self._stretch})
         self._recorded = self._tick = 0
         self._in_attempt = True
-        self._prime()
+        if self.settings.demonstrate:
+            self.operator.ask(Intent.TAKE_OVER, "attempt")
+        if self.settings.demonstrate != "hand":
+            self._prime()
         if event.attempt_index > 1:
             self.statistics.homing.append(time.monotonic() - self._ended)
         self.clock.restart()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +37,9 @@ class SessionSettings:
     """Real arm: seconds without a page that someone looks at after which the arm is held until Resume."""
     no_take_over: str = ""
     """Why a person cannot take the arm in this session; empty when one can."""
+    demonstrate: Literal["", "teleop", "hand"] = ""
+    """Attempts are a person's: steered (teleop), or the arm is led by hand. Each is then kept, discarded or recorded
+    again, and `trials` counts those that were kept."""
     first_stretch: int = 1
     """Real arm: ticks that each tick of the session's first attempt takes; that trial is left out of statistics."""
 

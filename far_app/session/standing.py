@@ -36,15 +36,14 @@ class Standing:
         recorder: Recorder,
         board: Board,
         publisher: TelemetryPublisher | None,
-        no_take_over: str = "",
     ) -> None:
         self.robot, self.recorder, self.board = robot, recorder, board
         self._override, self._publisher = override, publisher
         self.state = State.READY
         self.phase = ""
         """Of the trial: far_app/trial.py's, or "between"."""
-        self.no_take_over = no_take_over
-        """Why nobody can take over in this session."""
+        self.withheld: dict[Intent, str] = {}
+        """Why the session itself refuses an intent that its state would let pass."""
         self.skipping = False
         """The operator skips this trial: it ends with its running attempt."""
         self.no_lesson = False
@@ -60,10 +59,10 @@ class Standing:
     def refusal(self, intent: Intent) -> str:
         """Why an intent does not apply now; empty when it does."""
         why = refusal(self.state, intent)
+        if not why and self.withheld.get(intent):
+            return f"'{intent}' is refused: {self.withheld[intent]}"
         if why or intent is not Intent.TAKE_OVER:
             return why
-        if self.no_take_over:
-            return f"'{intent}' is refused: {self.no_take_over}"
         if self.phase not in ("attempt", "judging"):
             return f"'{intent}' is refused while the arm goes home: only an attempt can be taken over"
         return ""

@@ -80,7 +80,7 @@ class Helper:
         device = self._device
         return Steering(
             source=self.hand.source or "" if self.steers else "", silent=self.silence(),
-            unavailable=self.standing.no_take_over, device=device.name if device else "",
+            unavailable=self.standing.withheld.get(Intent.TAKE_OVER, ""), device=device.name if device else "",
             trouble=device.trouble if device else "", ticks=self.ticks,
         )  # fmt: skip
 

@@ -88,6 +88,11 @@ class Supervision:
             self._notice(phase)
         self.clock.restart()
 
+    def attend_between(self) -> None:
+        """Look at the arm while nothing runs: a latch, a fault, a recording that stopped."""
+        self._fetch()
+        self._notice("between")
+
     def await_scene(self) -> bool:
         """Hold until the operator has rebuilt the scene and says that the workspace is clear; False when the session
         ended instead."""

@@ -22,6 +22,8 @@ OVERSPEED = 1200.0
 """Millimetres a second implied by a target that raise C60."""
 SHORTEST = 0.004
 """Seconds: targets are taken at 250 Hz at most, so one that comes sooner after another is not faster for it."""
+MANUAL = 2
+"""The mode in which the arm gives way to a person's hands."""
 EMERGENCY = (1, 2, 3)
 """Errors of an emergency stop: the motors lose their power."""
 
@@ -86,6 +88,14 @@ class FakeArm:
             return
         self._target_at = now
         self._goal = (position, quaternion / np.linalg.norm(quaternion))
+
+    def lead(self, offset: np.ndarray) -> bool:
+        """A person pushes the hand this far, millimetres; only in manual mode, and able to move, does it give way."""
+        if self.mode != MANUAL or self.state not in (ArmState.READY, ArmState.MOVING):
+            return False
+        self.position = self.position + offset
+        self._goal = (self.position.copy(), self.quaternion.copy())
+        return True
 
     def fail(self, code: int) -> None:
         """An error: the arm stops where it is."""

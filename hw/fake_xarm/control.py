@@ -72,6 +72,10 @@ class FakeXArm:
         """The controller raises an error and stops the arm."""
         self.tell(do="error", code=code)
 
+    def lead(self, x: float, y: float, z: float) -> bool:
+        """A person pushes the hand, millimetres; False when the arm does not give way."""
+        return bool(self.tell(do="lead", by=[x, y, z])["gave_way"])
+
     def faults(self, stall_in: float = 1.0, **values: float | bool) -> None:
         """Set fields of hw.fake_xarm.faults.Faults; a stall begins after `stall_in` seconds."""
         self.tell(do="faults", set=values, stall_in=stall_in)

@@ -15,6 +15,8 @@ import struct
 import time
 from dataclasses import asdict, fields
 
+import numpy as np
+
 from far_app.errors import RobotError
 from hw.fake_xarm.arm import FakeArm
 from hw.fake_xarm.commands import answer
@@ -185,6 +187,8 @@ class FakeController:
                 await self._restart(float(words.get("seconds", 2.0)))
             case "object":
                 self.gripper.object = None if words.get("at") is None else float(words["at"])
+            case "lead":
+                return {**self._state(), "gave_way": self.arm.lead(np.array(words["by"], float))}
             case "set":
                 setattr(self.arm, words["name"], words["value"])
             case "received":

@@ -26,8 +26,8 @@ from hw.plant import Measured
 from hw.rig import RigConfig
 from hw.safety import near, near_turn
 from hw.xarm7.links import Links
-from hw.xarm7.sdk import ABLE, HAS_ERROR, NOT_CONNECTED, OK, SERVO_MODE, TIMEOUT, error_text
-from hw.xarm7.start import clear_errors, enter_servo_mode
+from hw.xarm7.sdk import ABLE, HAS_ERROR, MANUAL_MODE, NOT_CONNECTED, OK, SERVO_MODE, TIMEOUT, error_text
+from hw.xarm7.start import clear_errors, enter_manual_mode, enter_servo_mode
 from hw.xarm7.telling import Told
 from hw.xarm7.units import axis_angle
 
@@ -58,6 +58,8 @@ class XArmPlant:
         self._fault = ""
         self._halts = 0
         self._halted = self._armed = False
+        self.guided = False
+        self._guided_at = -math.inf
         self._sent: Pose | None = None
         self._sent_at = self._armed_at = -math.inf
         self._unanswered = 0
@@ -87,6 +89,9 @@ class XArmPlant:
 
     def servo(self, pose: Pose, gripper: float) -> None:
         """Blocks for a round trip, at most settings.call_timeout."""
+        if self.guided and not self._fault:
+            self.links.gripper.wish(gripper)
+            return
         if self._fault or self._halted or not self._armed or self._sent is None:
             return
         if not np.isfinite(pose.position).all() or not np.isfinite(pose.quaternion).all():
@@ -110,6 +115,25 @@ class XArmPlant:
         assert told is not None, "Links.open waited for the first report"
         return told
 
+    def guide(self, on: bool) -> None:
+        """The vendor's manual mode, and back to servo mode where the arm stands."""
+        if self._fault or self._halted:
+            self.guided = False
+            if on:
+                raise RobotError(
+                    f"the arm cannot be led by hand: {self._fault or 'it was stopped'}; press Resume first"
+                )
+            return
+        self._armed = False
+        self.links.motion.set_timeout(SETTING_UP)
+        halts = self._halts
+        if on:
+            enter_manual_mode(self.links.motion, self.links.telling, lambda: self._halts != halts)
+            self._guided_at = time.monotonic()
+        else:
+            self._arm(halts)
+        self.guided = on
+
     def rearm(self) -> None:
         """On the operator's Resume only. Blocks for a second or so, ten when it must reconnect. Raises RobotError."""
         halts = self._halts
@@ -117,7 +141,7 @@ class XArmPlant:
             log.warning("connecting anew (lost: %s)", self.links.lost() or "no answers")
             self.links.close()
             self.links = Links.open(self.rig)
-        self._armed, self._unanswered = False, 0
+        self._armed, self._unanswered, self.guided = False, 0, False
         self.links.motion.set_timeout(SETTING_UP)
         clear_errors(self.links.motion, self.links.telling)
         self.links.gripper.enable_again()
@@ -126,7 +150,7 @@ class XArmPlant:
 
     def close(self) -> None:
         """Leave servo mode, let go of the connections."""
-        if self._armed and not self.links.lost():
+        if (self._armed or self.guided) and not self.links.lost():
             self.links.motion.set_mode(0)
             self.links.motion.set_state(0)
         self.links.close()
@@ -199,6 +223,8 @@ class XArmPlant:
                 f"the arm left servo mode (it reports mode {told.mode}, state {told.state}): paused, stopped or "
                 "configured from elsewhere, such as UFACTORY Studio; end that, then press Resume"
             )
+        if self.guided and told.mode != MANUAL_MODE and told.at > self._guided_at:
+            return f"the arm left its manual mode (it reports mode {told.mode}): look at it, then press Resume"
         if now - links.telling.slow_at > SLOW_SILENCE:
             return (
                 f"the controller has sent no report with error codes for {now - links.telling.slow_at:.1f} s (limit "

@@ -28,6 +28,8 @@ Report = Literal["rich", "real", "none"]
 OK, HAS_ERROR, TIMEOUT, NOT_READY, NOT_CONNECTED = 0, 1, 3, 9, -1
 """Return codes of calls (xarm/x3/code.py)."""
 SERVO_MODE = 1
+MANUAL_MODE = 2
+"""The arm gives way to a person's hands."""
 ABLE = (1, 2)
 """States in which the arm follows: moving, ready."""
 KEEPALIVE = ((socket.TCP_KEEPIDLE, 2), (socket.TCP_KEEPINTVL, 1), (socket.TCP_KEEPCNT, 3))

@@ -15,7 +15,7 @@ from xarm.wrapper import XArmAPI
 
 from far_app.errors import RobotError
 from far_app.types import Pose
-from hw.xarm7.sdk import ABLE, SERVO_MODE, check, error_text
+from hw.xarm7.sdk import ABLE, MANUAL_MODE, SERVO_MODE, check, error_text
 from hw.xarm7.settings import XArmSettings
 from hw.xarm7.telling import Telling
 from hw.xarm7.units import MM, axis_angle, offset_to_wire
@@ -88,17 +88,28 @@ def enter_servo_mode(api: XArmAPI, telling: Telling, settings: XArmSettings, hal
     return here
 
 
-def _wait_able(telling: Telling) -> Pose:
-    """The pose, once a fresh report shows servo mode and a state that follows."""
+def enter_manual_mode(api: XArmAPI, telling: Telling, halted: Callable[[], bool]) -> None:
+    """The mode in which a person leads the arm by hand: its load must be the rig's (`configure` saw to that), or it
+    sinks. Raises RobotError where the controller does not follow, or `halted` turned true."""
+    for mode in (0, MANUAL_MODE):
+        if halted():
+            raise RobotError("STOP was pressed while the arm was made ready; look, then press Resume again")
+        check(api.set_mode(mode), f"mode {mode}")
+        check(api.set_state(0), "to become ready")
+    _wait_able(telling, MANUAL_MODE, "manual mode")
+
+
+def _wait_able(telling: Telling, mode: int = SERVO_MODE, name: str = "servo mode") -> Pose:
+    """The pose, once a fresh report shows the mode and a state that follows."""
     deadline = time.monotonic() + PATIENCE
     told, after = None, time.monotonic()
     while time.monotonic() < deadline:
         told = telling.wait_fast(after, PATIENCE)
-        if told is not None and told.mode == SERVO_MODE and told.state in ABLE:
+        if told is not None and told.mode == mode and told.state in ABLE:
             return told.pose
         after = told.at if told is not None else after
     shown = f"mode {told.mode}, state {told.state}" if told is not None else "nothing"
     raise RobotError(
-        f"the controller did not enter servo mode within {PATIENCE:g} s (it reports {shown}, needed: mode "
-        f"{SERVO_MODE}, state 1 or 2); look at it in UFACTORY Studio, then press Resume again"
+        f"the controller did not enter {name} within {PATIENCE:g} s (it reports {shown}, needed: mode "
+        f"{mode}, state 1 or 2); look at it in UFACTORY Studio, then press Resume again"
     )
