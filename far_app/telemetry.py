@@ -84,6 +84,10 @@ class Telemetry:
     task: str = ""
     method: str = ""
     policy_version: str = ""
+    engine: str = ""
+    """What runs the policy's network."""
+    engine_refused: tuple[str, ...] = ()
+    """Engines that should have run it and could not: each "name: error"."""
     trial: int = 0
     """1-based."""
     trials: int = 0

@@ -266,6 +266,10 @@ def loop_gauges(telemetry: Telemetry | None) -> tuple[Gauge, ...]:
         Gauge(label="overruns", value=str(loop.overruns), tone=Tone.BAD if loop.overruns else Tone.IDLE),
         Gauge(label="starved", value=str(loop.starved), tone=Tone.WARN if loop.starved else Tone.IDLE),
     ]
+    if telemetry.engine:
+        refused = ", ".join(r.split(":")[0] for r in telemetry.engine_refused)
+        word, tone = (f" ({refused} refused)", Tone.WARN) if refused else ("", Tone.IDLE)
+        gauges.append(Gauge(label="engine", value=telemetry.engine + word, tone=tone))
     if robot is not None:
         gauges.append(Gauge(label="holds", value=str(robot.holds), tone=Tone.WARN if robot.holds else Tone.IDLE))
         gauges.append(Gauge(label="clips", value=str(robot.clips)))

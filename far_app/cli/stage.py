@@ -166,8 +166,9 @@ Assembling = Callable[[RunOptions, TaskConfig], Mapping[str, Parts]]
 def one_method(options: RunOptions, task: TaskConfig) -> Mapping[str, Parts]:
     """What the options themselves ask for."""
     parts = assemble(
-        options.method, task, options.policy, options.critic, options.device, options.retry, options.engine
-    )
+        options.method, task, options.policy, options.critic, options.device, options.retry, options.engine,
+        threads=options.torch_threads,
+    )  # fmt: skip
     return {options.method: parts}
 
 

@@ -113,7 +113,9 @@ def assembled(plan: TrialPlan, options: RunOptions, task: TaskConfig) -> Mapping
             continue
         if key not in models:
             sharing = [m.method for m in plan.methods if (m.policy, m.critic) == key]
-            models[key] = load_model(*key, task.name, options.device, sharing, options.engine)
+            models[key] = load_model(
+                *key, task.name, options.device, sharing, options.engine, threads=options.torch_threads
+            )
         parts[method.name] = equip(models[key], method.method, retry)
     return parts
 

@@ -11,6 +11,7 @@ import numpy as np
 from far_app.config import TaskConfig
 from far_app.lineage import Versions
 from far_app.motion import ActionScale
+from far_app.protocols import EngineReport
 from far_app.session.history import History
 from far_app.session_states import Intent, State
 from far_app.take_over import Steering
@@ -54,6 +55,8 @@ class Board:
         self.blind = False
         """Nothing that gives the method away is shown."""
         self._max_attempts = task.max_attempts
+        self.engine = EngineReport(name="")
+        """What runs the policy of the attempt."""
 
     def log(self, text: str, level: str = "info") -> None:
         self._log.append(LogLine(stamp=time.monotonic(), level=level, text=text))
@@ -115,8 +118,9 @@ class Board:
             status = "update" if self.adaptation_steps else "attribution" if latest is None else "candidates"
         whole = Telemetry(
             seq=0, stamp=0.0, state=state, reason=self.reason, countdown=self.countdown, session=self._session,
-            task=self._task.name, method=self._method, policy_version=self.policy_version, trial=self.trial,
-            trials=self._trials, attempt=self.attempt, max_attempts=self._max_attempts, scene_seed=self.scene_seed,
+            task=self._task.name, method=self._method, policy_version=self.policy_version, engine=self.engine.name,
+            engine_refused=self.engine.refused, trial=self.trial, trials=self._trials, attempt=self.attempt,
+            max_attempts=self._max_attempts, scene_seed=self.scene_seed,
             tick=len(self._values), horizon=self._task.horizon, rate=self._task.rate, chunk_horizon=self._chunk_horizon,
             values=np.array(values, dtype=float),
             value_changes=curve.value_changes if curve else np.zeros(0),

@@ -18,7 +18,7 @@ from far_app.detectors import OperatorOverride
 from far_app.errors import RobotError
 from far_app.guided import guided_trial
 from far_app.motion import ActionScale
-from far_app.protocols import Hold, Method, PlanRequest, Robot, SuccessDetector
+from far_app.protocols import EngineReport, Hold, Method, PlanRequest, Robot, RunsOnEngine, SuccessDetector
 from far_app.scheduling import LOOP_PRIORITY, real_time_inside
 from far_app.session.board import Board
 from far_app.session.clock import TickClock
@@ -256,6 +256,8 @@ class Session:
         self.helper.attempt_begins()
         version = self.versions.attempt_begins(event.policy_version)
         self.board.attempt_started(event.attempt_index, version)
+        if isinstance(self.method.policy, RunsOnEngine):
+            self._runs_on(self.method.policy.runs_on)
         self.recorder.begin_attempt(event.attempt_index, version)
         if slowly:
             self.standing.say(f"attempt {event.attempt_index} runs at 1/{self._stretch} of the policy's speed")
@@ -269,6 +271,15 @@ class Session:
         if event.attempt_index > 1:
             self.statistics.homing.append(time.monotonic() - self._ended)
         self.clock.restart()
+
+    def _runs_on(self, engine: EngineReport) -> None:
+        """Show and record what runs the policy; what was refused (and logged where it was) is told once."""
+        known = self.board.engine
+        for refused in engine.refused[len(known.refused) :]:
+            self.board.log(f"engine refused, {refused}; {engine.name} runs the policy", "warning")
+        if engine != known:
+            self.recorder.event("engine", engine.name, {"why": engine.why, "refused": list(engine.refused)})
+        self.board.engine = engine
 
     def _attempt_ended(self, event: AttemptEnded) -> None:
         attempt, standing = event.attempt, self.standing

@@ -12,7 +12,7 @@ import pytest
 from far_app.detectors import PersonJudge, TwinCheck
 from far_app.errors import RecordingError
 from far_app.motion import ActionScale
-from far_app.protocols import Hold, Home, Resume
+from far_app.protocols import EngineReport, Hold, Home, Resume
 from far_app.recording.inspect import inspect_session
 from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
@@ -297,3 +297,16 @@ def test_stop_while_a_person_is_asked_ends_the_attempt():
     desk.when(lambda: desk.state is State.STOPPED, lambda: desk.inbox.put(Intent.RESUME))
     (result,) = desk.session.run()
     assert (result.success, result.judged_by) == (False, "operator")
+
+
+def test_what_runs_the_policy_is_shown_and_a_refused_engine_is_told_once():
+    class OnEngine(Forward):
+        runs_on = EngineReport(name="arranged", why="fastest here", refused=("openvino: it differs by 0.1",))
+
+    desk = Desk(policy=OnEngine(), trials=2)
+    desk.session.run()
+    shown = desk.session.board.telemetry(desk.state, None)
+    assert (shown.engine, shown.engine_refused) == ("arranged", ("openvino: it differs by 0.1",))
+    told = [line for line in shown.log if "refused" in line.text]
+    assert [line.level for line in told] == ["warning"]
+    assert told[0].text == "engine refused, openvino: it differs by 0.1; arranged runs the policy"

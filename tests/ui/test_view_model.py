@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from ui_stage import adapting, rows, running, stopped
@@ -94,6 +95,16 @@ def test_before_any_failure_the_card_is_blank() -> None:
 def test_trouble_in_the_loop_stands_out(loop: LoopHealth, label: str) -> None:
     gauges = loop_gauges(replace(running(), loop=loop))
     assert {g.label for g in gauges if g.tone is not Tone.IDLE} == {label}
+
+
+def test_the_engine_is_shown_and_a_refused_one_stands_out() -> None:
+    def engine(**fields: Any) -> Any:
+        return next((g for g in loop_gauges(replace(running(), **fields)) if g.label == "engine"), None)
+
+    assert engine() is None
+    assert (engine(engine="openvino").value, engine(engine="openvino").tone) == ("openvino", Tone.IDLE)
+    refused = engine(engine="torch", engine_refused=("openvino: it differs", "arranged: no"))
+    assert (refused.value, refused.tone) == ("torch (openvino, arranged refused)", Tone.WARN)
 
 
 def test_the_arm_speaks_for_itself() -> None:
