@@ -49,7 +49,9 @@ class Panel(Protocol):
     """Page units."""
 
     @property
-    def items(self) -> Sequence[Item]: ...
+    def items(self) -> Sequence[Item]:
+        """Its buttons."""
+        ...
 
     def html(self, telemetry: Telemetry | None) -> str:
         """Its words, above and between the buttons."""

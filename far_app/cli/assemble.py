@@ -37,6 +37,8 @@ class Parts:
     """Checkpoint, for people and the recording."""
     max_attempts: int | None
     """Attempts a trial where the method fixes them."""
+    checkpoint: str | None
+    """As it was asked for; None for the shipped one."""
     another: Callable[[], Method]
     """One more method of the same parts, for a trial beside; the base policy is shared, so that they plan together."""
 
@@ -61,6 +63,8 @@ class Model:
     critic_file: Path | None
     """None where the weights are random."""
     name: str
+    checkpoint: str | None
+    """As it was asked for; None for the shipped one."""
     act: Act
     """Makes acting policies; the base policy is one object for all, so that trials plan together."""
 
@@ -81,7 +85,9 @@ def assemble(
         from far_app.cli._scripted import ScriptedMethod
 
         scripted = ScriptedMethod(policy.removeprefix("test:"))
-        return Parts(method=scripted, policy_name=policy, max_attempts=None, another=lambda: scripted)
+        return Parts(
+            method=scripted, policy_name=policy, max_attempts=None, checkpoint=policy, another=lambda: scripted
+        )
     return equip(load_model(policy, critic, task.name, device, [method], engine, lanes), method, retry)
 
 
@@ -122,7 +128,7 @@ def load_model(
             base[version] = policy
         return policy
 
-    return Model(network=network, critic=critic_network, critic_file=beside, name=name, act=act)
+    return Model(network=network, critic=critic_network, critic_file=beside, name=name, checkpoint=policy, act=act)
 
 
 def equip(model: Model, method: str, retry: RetryConfig) -> Parts:
@@ -141,7 +147,7 @@ def equip(model: Model, method: str, retry: RetryConfig) -> Parts:
     )
     return Parts(
         method=make_method(method, ingredients), policy_name=model.name, max_attempts=entry.attempts,
-        another=lambda: make_method(method, ingredients),
+        checkpoint=model.checkpoint, another=lambda: make_method(method, ingredients),
     )  # fmt: skip
 
 
