@@ -12,8 +12,12 @@ from far_app.lineage import Versions
 from far_app.marks import Judged
 from far_app.session_states import Intent, State
 from far_app.take_over import Steering
+from far_app.trial_plan.shown import PlanShown, SceneShown
 from far_app.types import AdaptationStep, Pose, RobotStatus
 from far_app.wire import register
+
+HIDDEN = "hidden"
+"""Telemetry.adaptation_status where a blinded plan must not tell whether the method learns."""
 
 
 @register
@@ -130,6 +134,10 @@ class Telemetry:
     """Intents that apply now."""
     steering: Steering = field(default_factory=Steering)
     """A person's part in the attempt."""
+    plan: PlanShown | None = None
+    """The plan of trials that is run, if one is."""
+    scene: SceneShown | None = None
+    """A plan's real scene that is being rebuilt."""
 
 
 @register

@@ -28,8 +28,10 @@ from ui.panels import BLUE, Panels
 from ui.plots import Plots
 from ui.presence import Presence
 from ui.scene3d import BRAND, FLAGGED, Scene3D
+from ui.scene_overlay import SceneOverlay
 from ui.stop import StopLine
 from ui.take_over import TakeOver
+from ui.trials_panel import TrialsPanel
 from ui.view_model import Freshness, adaptation, arm_word, banner, control, loop_gauges, summary
 from ui.viewers import Live, Viewers
 
@@ -125,6 +127,7 @@ class Console:
         self._add_cameras()
         self.plots = Plots(gui)
         self._panels = self._add_panels()
+        self._plan, self._overlay = TrialsPanel(gui), SceneOverlay(gui, self._presses)
         self._foot = gui.add_html(html.foot((), "", None, ""))
         self._viewers = Viewers(self._server, self._presses, self._presence, Page.CONSOLE)
         gui.add_html(
@@ -208,6 +211,8 @@ class Console:
         self._stop_note.content = html.stop_note(self._stop.result, latched, status.reason if status else "")
         self._show_controls(telemetry, fresh, taken_over)
         self._panels.show(telemetry)
+        self._plan.show(telemetry)
+        self._overlay.show(telemetry, view)
         self._adapt.content = html.adaptation(adaptation(telemetry))
         refusal = self.refusal if time.monotonic() - self._refused_at < 6 else ""
         gauges, session = loop_gauges(telemetry), telemetry.session if telemetry else ""

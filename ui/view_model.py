@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from far_app.session_states import Intent, State
-from far_app.telemetry import Telemetry, TrialRow
+from far_app.telemetry import HIDDEN, Telemetry, TrialRow
 from far_app.types import RobotMode, RobotStatus
 
 SILENT_AFTER = 1.5
@@ -206,6 +206,7 @@ _STATUS: dict[str, tuple[str, Tone]] = {
     "failed": ("failed: policy unchanged", Tone.BAD),
     "timeout": ("over its time limit: policy unchanged", Tone.WARN),
     "none": ("this method does not adapt", Tone.IDLE),
+    HIDDEN: ("not told: the plan is blinded", Tone.IDLE),
 }
 
 
@@ -214,7 +215,7 @@ def adaptation(telemetry: Telemetry | None) -> AdaptationCard:
     history = telemetry.adaptation if telemetry else ()
     status = telemetry.adaptation_status if telemetry else ""
     word, tone = _STATUS.get(status, (status, Tone.IDLE))
-    pairs = str(telemetry.pairs) if telemetry and status else "–"
+    pairs = str(telemetry.pairs) if telemetry and status not in ("", HIDDEN) else "–"
     step, loss, winner, loser = "–", "–", "–", "–"
     fraction = 0.0
     if history:

@@ -11,6 +11,7 @@ from far_app.errors import FarError
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("far_app.cli.run", "supervised trials: try, notice failure, learn, retry; with the operator page"),
+    "trials": ("far_app.cli.trials", "a plan of trials: methods × scenes, compared fairly; goes on where it stopped"),
     "hw-server": ("far_app.cli.hw_server", "own the arm on a machine of its own, for far run --hw on another"),
     "keys": ("far_app.cli.keys", "make the keys with which two machines trust each other"),
     "demo": ("far_app.cli.demo", "make demonstrations with the scripted expert"),

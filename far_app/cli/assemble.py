@@ -39,6 +39,8 @@ class Parts:
     """Checkpoint, for people and the recording."""
     max_attempts: int | None
     """Attempts a trial where the method fixes them."""
+    checkpoint: str | None
+    """As it was asked for; None for the shipped one."""
     another: Callable[[], Method]
     """One more method of the same parts, for a trial beside; the base policy is shared, so that they plan together."""
 
@@ -63,6 +65,8 @@ class Model:
     critic_file: Path | None
     """None where the weights are random."""
     name: str
+    checkpoint: str | None
+    """As it was asked for; None for the shipped one."""
     act: Act
     """Makes acting policies; the base policy is one object for all, so that trials plan together."""
     base: ActingPolicy
@@ -87,7 +91,9 @@ def assemble(
         from far_app.cli._scripted import ScriptedMethod
 
         scripted = ScriptedMethod(policy.removeprefix("test:"))
-        return Parts(method=scripted, policy_name=policy, max_attempts=None, another=lambda: scripted)
+        return Parts(
+            method=scripted, policy_name=policy, max_attempts=None, checkpoint=policy, another=lambda: scripted
+        )
     return equip(load_model(policy, critic, task.name, device, [method], engine, lanes, threads), method, retry)
 
 
@@ -129,8 +135,9 @@ def load_model(
         return ActingPolicy(network, version, critic_network, choice, steering, memory=memory, base=base)
 
     return Model(
-        network=network, critic=critic_network, critic_file=beside, name=name, act=act, memory=memory, base=base
-    )
+        network=network, critic=critic_network, critic_file=beside, name=name, checkpoint=policy, act=act,
+        memory=memory, base=base,
+    )  # fmt: skip
 
 
 def engine_choice(engine: str, network: DiffusionPolicy, lanes: int | None, threads: int) -> Choice:
@@ -158,7 +165,7 @@ def equip(model: Model, method: str, retry: RetryConfig) -> Parts:
     )  # fmt: skip
     return Parts(
         method=make_method(method, ingredients), policy_name=model.name, max_attempts=entry.attempts,
-        another=lambda: make_method(method, ingredients),
+        checkpoint=model.checkpoint, another=lambda: make_method(method, ingredients),
     )  # fmt: skip
 
 

@@ -34,9 +34,9 @@ class Desk:
     """A session with everything a test may want to touch."""
 
     def __init__(self, robot=None, policy=None, adapting_seconds=0.0, horizon=20, attempts=3, detector=None,
-                 writer=None, **settings) -> None:  # fmt: skip
+                 writer=None, method=None, course=None, **settings) -> None:  # fmt: skip
         self.robot = robot or KinematicRobot()
-        self.method = Faster(policy or Forward(), adapting_seconds)
+        self.method = method or Faster(policy or Forward(), adapting_seconds)
         self.inbox = IntentInbox()
         self.statistics = LoopStatistics()
         settings = {"name": "test", "trials": 1, "seed": 5, "headless": True} | settings
@@ -44,6 +44,7 @@ class Desk:
             settings=SessionSettings(**settings), robot=self.robot, planner=ThreadedPlanner(), method=self.method,
             detector=detector or TwinCheck(2), scale=ActionScale(), recorder=Recorder(writer), inbox=self.inbox,
             task=replace(task("lift"), horizon=horizon, max_attempts=attempts, rate=50.0), statistics=self.statistics,
+            course=course,
         )  # fmt: skip
 
     @property
@@ -252,8 +253,7 @@ def test_the_page_sees_the_flags_while_the_arm_goes_home():
             time.sleep(0.2)
             return replace(known, status="empty", flagged=(1,))
 
-    desk = Desk(policy=Forward(speed=0.01), horizon=5, attempts=2)
-    desk.session.method = desk.method = Telling(Forward(speed=0.01))
+    desk = Desk(method=Telling(Forward(speed=0.01)), horizon=5, attempts=2)
     shown = []
     desk.session.standing.show = lambda: shown.append(desk.session.board.telemetry(desk.state, None))
     desk.session.run()
