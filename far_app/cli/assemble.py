@@ -135,15 +135,9 @@ def load_model(
         return ActingPolicy(network, version, critic_network, choice, steering, memory=memory, base=base)
 
     return Model(
-        network=network,
-        critic=critic_network,
-        critic_file=beside,
-        name=name,
-        checkpoint=policy,
-        act=act,
-        memory=memory,
-        base=base,
-    )
+        network=network, critic=critic_network, critic_file=beside, name=name, checkpoint=policy, act=act,
+        memory=memory, base=base,
+    )  # fmt: skip
 
 
 def engine_choice(engine: str, network: DiffusionPolicy, lanes: int | None, threads: int) -> Choice:

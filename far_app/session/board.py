@@ -57,6 +57,12 @@ class Board:
         self._max_attempts = task.max_attempts
         self.engine = EngineReport(name="")
         """What runs the policy of the attempt."""
+        self.plan: PlanShown | None = None
+        self.scene: SceneShown | None = None
+        """A real scene of a plan that is being rebuilt."""
+        self.blind = False
+        """Nothing that gives the method away is shown."""
+        self._max_attempts = task.max_attempts
 
     def log(self, text: str, level: str = "info") -> None:
         self._log.append(LogLine(stamp=time.monotonic(), level=level, text=text))
