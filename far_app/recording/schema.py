@@ -197,7 +197,10 @@ CAMERA_TOPIC = "/camera/"
 
 LINES = {
     "session_started": "the writer is ready",
-    "trial_started": "`detail.scene_seed`",
+    "trial_started": "`detail.scene_seed`; in a plan also `detail.method`, `detail.label` (what the operator was told),"
+    " `detail.scene`, `detail.repetition`, `detail.max_attempts`, `detail.policy`",
+    "scene_matched": "a plan's real scene was ready: `detail.scene`, `detail.scores` by camera (none: the scene's "
+    "first start, which later ones are held against), `detail.limit`, `detail.pictures` by camera",
     "attempt_started": "`detail.file`, `detail.scene_seed`, `detail.policy_version`, `detail.previous`",
     "attempt_ended": "`detail.success`, `detail.judged_by`, `detail.note`, `detail.steps`; its steps are on the disk",
     "attempt_abandoned": "the attempt ended without an outcome; `text` says why, `detail.steps`",

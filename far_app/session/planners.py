@@ -35,6 +35,11 @@ def plan_together(requests: Mapping[int, PlanRequest]) -> dict[int, ActionChunk]
         noise = np.stack([keyed_noise(r.noise_key, spec.horizon, spec.action_dim) for r in some])
         planned = policy.plan([r.history for r in some], [r.tick for r in some], noise)
         for name, request, chunk in zip(names, some, planned, strict=True):
+            if chunk.policy_version != policy.version:
+                raise PolicyError(
+                    f"policy {policy.version} was asked at tick {request.tick} of attempt {request.noise_key[1]}, "
+                    f"but the weights of {chunk.policy_version} answered; start the run again with --engine torch"
+                )
             if not np.all(np.isfinite(chunk.actions)):
                 raise PolicyError(
                     f"policy {chunk.policy_version} planned a non-finite action at tick {request.tick} of attempt "

@@ -22,6 +22,7 @@ from far_app.endpoints import Endpoints
 from far_app.session_states import Intent, State
 from far_app.telemetry import (
     BodyMesh,
+    CameraHealth,
     GeometryRequest,
     LogLine,
     LoopHealth,
@@ -122,8 +123,12 @@ class Stage:
         self.advance = False
         """Let the attempt's tick go on by itself."""
         self.mode = RobotMode.TRACKING
+        self.cameras: dict[str, CameraHealth] = {}
+        """Empty, as on the twin."""
         self.intents: list[OperatorIntent] = []
         self.present: list[PagePresence] = []
+        self.words: list[Any] = []
+        """Nudges, marks and wishes."""
         self.stops: list[StopRequest] = []
         self.stop_answers = True
         self._bodies = bodies
@@ -170,15 +175,17 @@ class Stage:
         latched = self.mode is RobotMode.LATCHED
         status = RobotStatus(mode=self.mode, reason="STOP by the operator" if latched else "")
         jpegs = {name: picture(name, seq) for name in ("front", "wrist")}
-        return View(seq=seq, stamp=now, jpegs=jpegs, body_poses=poses, status=status)
+        return View(seq=seq, stamp=now, jpegs=jpegs, body_poses=poses, status=status, cameras=self.cameras)
 
     def _answer(self) -> None:
         while self._pull.poll(0):
             message = unpack(self._pull.recv())
             if isinstance(message, OperatorIntent):
                 self.intents.append(message)
-            else:
+            elif isinstance(message, PagePresence):
                 self.present.append(message)
+            else:
+                self.words.append(message)
         if self._geometry.poll(0):
             assert isinstance(unpack(self._geometry.recv()), GeometryRequest)
             vertices, faces = cube(0.08)
