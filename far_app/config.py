@@ -14,9 +14,9 @@ T = TypeVar("T")
 Arm = Literal["xarm7", "panda"]
 
 
-def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
-    """Settings from a TOML table, nested as the dataclasses are; what is not given keeps its default. Raises
-    ConfigError that names the place and what is known there."""
+def from_table(cls: type[T], table: Mapping[str, Any], where: str, base: T | None = None) -> T:
+    """Settings from a TOML table, nested as the dataclasses are; what is not given keeps its default, or what `base`
+    has there. Raises ConfigError that names the place and what is known there."""
     fields = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
     unknown = sorted(set(table) - set(fields))
     if unknown:
@@ -27,11 +27,11 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
             expected = "a value" if isinstance(value, dict) else "a table"
             raise ConfigError(f"{where}.{key} is {value!r}, must be {expected}")
         if isinstance(value, dict):
-            values[key] = from_table(kinds[key], value, f"{where}.{key}")
+            values[key] = from_table(kinds[key], value, f"{where}.{key}", getattr(base, key) if base else None)
         else:
             values[key] = tuple(value) if isinstance(value, list) else value
     try:
-        return cls(**values)
+        return cls(**values) if base is None else dataclasses.replace(base, **values)  # type: ignore[type-var]
     except TypeError as error:
         raise ConfigError(f"{where}: {error}") from error
 

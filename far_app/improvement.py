@@ -6,7 +6,7 @@ Pure: far_app/cli/improve.py runs it, far_app/learning/improve.py learns.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -113,6 +113,24 @@ def read_log(path: Path) -> list[Epoch]:
         except json.JSONDecodeError:
             continue
     return found
+
+
+def before_and_after(before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]) -> str:
+    """What learning did to the policy alone, from the records of two evaluations: on the scenes of both, so that each
+    scene is its own control. One line of Markdown."""
+    from far_app.statistics import mcnemar, paired_difference
+
+    was, now = ({int(r["scene"]): bool(r["success"]) for r in records} for records in (before, after))
+    scenes = sorted(was.keys() & now.keys())
+    if not scenes:
+        return "before and after share no scene: nothing to compare"
+    mean, low, high = paired_difference([now[s] for s in scenes], [was[s] for s in scenes])
+    gained, lost = sum(now[s] and not was[s] for s in scenes), sum(was[s] and not now[s] for s in scenes)
+    span = f" [{100 * max(-1.0, low):+.1f}, {100 * min(1.0, high):+.1f}]" if high > low and len(scenes) > 1 else ""
+    return (
+        f"after − before on the same {len(scenes)} scenes: {100 * mean:+.1f} points{span}; {gained} gained, {lost} "
+        f"lost, exact McNemar p = {mcnemar(gained, lost):.3g}"
+    )
 
 
 def table(epochs: Sequence[Epoch]) -> str:

@@ -148,6 +148,25 @@ class Policy(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
+class EngineReport:
+    """What runs a policy's network, for people."""
+
+    name: str
+    why: str = ""
+    """Why this one."""
+    refused: tuple[str, ...] = ()
+    """Engines that should have been taken and could not be: each "name: error"."""
+
+
+@runtime_checkable
+class RunsOnEngine(Protocol):
+    """A policy that can tell what runs it."""
+
+    @property
+    def runs_on(self) -> EngineReport: ...
+
+
+@dataclass(frozen=True, kw_only=True)
 class PlanRequest:
     """What a planner may yield to the driver of a trial, so that many trials share one batch."""
 

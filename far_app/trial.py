@@ -128,18 +128,23 @@ def trial(
     stretch: int = 1,
     alarm: Alarm = NO_ALARM,
     person: Person = NOBODY,
+    chance: int | None = None,
 ) -> TrialEvents:
-    """Algorithm 1. Returns the trial's attempts and adaptations; afterwards the method holds the base policy again."""
+    """Algorithm 1. Returns the trial's attempts and adaptations; afterwards the method holds the base policy again.
+
+    `chance` keys noise and perturbation, so that a scene can be repeated with other draws; the scene's seed does by
+    default."""
     attempts: list[Attempt] = []
     adaptations: list[Adaptation] = []
-    method.begin(scene_seed)
+    chance = scene_seed if chance is None else chance
+    method.begin(chance)
     robot.request(Reset(seed=scene_seed))
     yield from go_home(robot, attempt_index=1)
     for i in range(1, task.max_attempts + 1):
         yield AttemptStarted(attempt_index=i, policy_version=method.policy.version)
         slowly = stretch if i == 1 else 1
         attempt = yield from execute(
-            robot, planner, method, detector, task, scale, scene_seed, i, slowly, alarm, person
+            robot, planner, method, detector, task, scale, scene_seed, i, slowly, alarm, person, chance
         )  # fmt: skip
         attempts.append(attempt)
         last = attempt.outcome.success or i == task.max_attempts
@@ -150,7 +155,7 @@ def trial(
         yield from go_home(robot, attempt_index=i + 1, until=adaptation.done)
         adaptations.append(adaptation.result())
         yield Adapted(adaptation=adaptations[-1])
-    method.begin(scene_seed)
+    method.begin(chance)
     return Trial(scene_seed=scene_seed, attempts=tuple(attempts), adaptations=tuple(adaptations))
 
 
@@ -166,6 +171,7 @@ def execute(
     stretch: int = 1,
     alarm: Alarm = NO_ALARM,
     person: Person = NOBODY,
+    chance: int | None = None,
 ) -> Generator[Event, float | ActionChunk | None, Attempt]:
     """One attempt. A tick: observe → judge → chunk → aggregate → perturb → target.
 
@@ -175,7 +181,8 @@ def execute(
     spec = method.policy.spec
     shares = np.array((stretch,) * ARM_DIMS + (1,))  # the gripper is told the whole of its action in every part
     plan = Plan(horizon=spec.horizon)
-    perturbation = method.perturb(index, scene_seed)
+    chance = scene_seed if chance is None else chance
+    perturbation = method.perturb(index, chance)
     history: deque[Observation] = deque(maxlen=spec.n_obs)
     steps: list[Step] = []
     step: Step | None = None
@@ -207,7 +214,7 @@ def execute(
             break
 
         history.extend([observation] * (spec.n_obs if not history else 1))
-        for chunk in (yield from planner.plan(tuple(history), t, (scene_seed, index, t))):
+        for chunk in (yield from planner.plan(tuple(history), t, (chance, index, t))):
             plan.add(chunk)
             if chunk.tick < len(steps):  # V(s_k) of an earlier tick, computed in time for the record
                 steps[chunk.tick] = replace(steps[chunk.tick], value=chunk.value)

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from far_app.cli import main
 from far_app.config import PerturbationConfig
 from far_app.errors import ConfigError
 from far_app.evaluation import DEV_SCENES, REPORT_SCENES
-from far_app.improvement import Epoch, Improvement, Noisy, read_log, table
+from far_app.improvement import Epoch, Improvement, Noisy, before_and_after, read_log, table
 from far_app.learning.critic import Critic, CriticShape
 from far_app.learning.critic_file import load_critic, save_critic
 from far_app.learning.dataset import Episode, read_episodes
@@ -23,7 +24,7 @@ from far_app.learning.train_critic import CriticTraining
 from far_app.perturbation import perturbation
 from far_app.recording.episodes import session_episodes
 
-from .recording import sessions
+from .recording import sessions, values
 
 
 def test_no_epoch_collects_where_another_did_or_where_policies_are_judged():
@@ -118,8 +119,44 @@ def test_a_recorded_session_is_experience_with_the_last_word_said_on_it(tmp_path
         session_episodes(folder, "can")
 
 
+def test_before_and_after_are_compared_scene_by_scene():
+    def records(solved):
+        return [{"scene": s, "success": s in solved} for s in range(10)]
+
+    line = before_and_after(records({0, 1, 2}), [*records({1, 2, 3, 4, 5, 6, 7}), {"scene": 99, "success": True}])
+    assert "same 10 scenes: +40.0 points [" in line and "5 gained, 1 lost" in line and "p = 0.219" in line
+    assert "+0.0 points;" in before_and_after(records({1}), records({1}))
+    assert "share no scene" in before_and_after([], records({1}))
+
+
+def test_sessions_that_cannot_tell_before_from_after_are_refused_before_anything_is_evaluated(tmp_path, capsys):
+    policy, _ = models(tmp_path / "base")
+    pictures = Path(__file__).parents[1] / "recordings" / "sample"
+    words = ["improve", "--policy", str(policy), "--out", str(tmp_path / "out"), "--from"]
+    copy = tmp_path / "judged"
+    shutil.copytree(pictures, copy)
+    header = json.loads((copy / "session.json").read_text())
+    header["info"]["rig"]["robot"] = "twin"
+    (copy / "session.json").write_text(json.dumps(header))
+    seed = session_episodes(copy, "lift")[0].seed
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("far_app.cli.improve.REPORT_SCENES", seed)
+        assert main([*words, str(copy)]) == 2
+    assert f"its scene {seed} is one that before and after are judged on" in capsys.readouterr().err
+    small = sessions.small_session(tmp_path, steps=4)
+    out = ["--out", str(tmp_path / "out"), "--data", str(tmp_path / "none.hdf5")]
+    assert main(["improve", *out, "--from", str(small)]) == 2
+    assert "no demonstrations at" in capsys.readouterr().err
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(values, "frame", lambda number, camera, size=96: np.zeros((96, 96, 3), np.uint8))
+        large = sessions.small_session(tmp_path / "large", steps=4)
+    assert main(["improve", *out, "--from", str(large)]) == 2
+    assert "pictures of 96×96 of camera 'front'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.slow
-def test_a_policy_is_finetuned_on_the_sample_session(tmp_path):
+def test_a_policy_is_finetuned_on_the_sample_session(tmp_path, capsys):
     sample = Path(__file__).parents[1] / "recordings" / "sample"
     data = tmp_path / "lift.hdf5"
     assert main(["demo", "--n", "1", "--out", str(data)]) == 0
@@ -131,6 +168,7 @@ def test_a_policy_is_finetuned_on_the_sample_session(tmp_path):
     assert before.evaluation is not None and after.evaluation is not None
     assert after.successes + after.failures == len(session_episodes(sample, "lift")) > 0
     assert (out / "epoch-01" / "policy.safetensors").exists()
+    assert "after − before on the same 1 scenes" in capsys.readouterr().out
 
 
 @pytest.mark.slow

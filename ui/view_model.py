@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from far_app.session_states import Intent, State
-from far_app.telemetry import Telemetry, TrialRow
+from far_app.telemetry import HIDDEN, CameraHealth, Telemetry, TrialRow
 from far_app.types import RobotMode, RobotStatus
 
 SILENT_AFTER = 1.5
@@ -206,6 +206,7 @@ _STATUS: dict[str, tuple[str, Tone]] = {
     "failed": ("failed: policy unchanged", Tone.BAD),
     "timeout": ("over its time limit: policy unchanged", Tone.WARN),
     "none": ("this method does not adapt", Tone.IDLE),
+    HIDDEN: ("not told: the plan is blinded", Tone.IDLE),
 }
 
 
@@ -214,7 +215,7 @@ def adaptation(telemetry: Telemetry | None) -> AdaptationCard:
     history = telemetry.adaptation if telemetry else ()
     status = telemetry.adaptation_status if telemetry else ""
     word, tone = _STATUS.get(status, (status, Tone.IDLE))
-    pairs = str(telemetry.pairs) if telemetry and status else "–"
+    pairs = str(telemetry.pairs) if telemetry and status not in ("", HIDDEN) else "–"
     step, loss, winner, loser = "–", "–", "–", "–"
     fraction = 0.0
     if history:
@@ -265,6 +266,10 @@ def loop_gauges(telemetry: Telemetry | None) -> tuple[Gauge, ...]:
         Gauge(label="overruns", value=str(loop.overruns), tone=Tone.BAD if loop.overruns else Tone.IDLE),
         Gauge(label="starved", value=str(loop.starved), tone=Tone.WARN if loop.starved else Tone.IDLE),
     ]
+    if telemetry.engine:
+        refused = ", ".join(r.split(":")[0] for r in telemetry.engine_refused)
+        word, tone = (f" ({refused} refused)", Tone.WARN) if refused else ("", Tone.IDLE)
+        gauges.append(Gauge(label="engine", value=telemetry.engine + word, tone=tone))
     if robot is not None:
         gauges.append(Gauge(label="holds", value=str(robot.holds), tone=Tone.WARN if robot.holds else Tone.IDLE))
         gauges.append(Gauge(label="clips", value=str(robot.clips)))
@@ -274,6 +279,22 @@ def loop_gauges(telemetry: Telemetry | None) -> tuple[Gauge, ...]:
         Gauge(label="max", value=f"{loop.late_max_ms:.1f} ms"),
         Gauge(label="plan age", value=f"{loop.plan_age_ticks:.1f} ticks"),
     )
+
+
+OLD_PICTURE = 0.25
+"""Seconds of a camera's newest picture from which its age is told; the arm is held by then."""
+
+
+def camera_note(health: CameraHealth | None) -> tuple[str, Tone]:
+    """What is wrong with a camera's pictures, now and so far; empty while all were well, and for drawn ones."""
+    if health is None:
+        return "", Tone.IDLE
+    reopened = f"back {health.reopened}×" if health.reopened else ""
+    counts = [f"{n} {word}" for word in ("dropped", "stale", "frozen") if (n := getattr(health, word))]
+    so_far = " · ".join(counts + [reopened] * bool(reopened))
+    if health.age > OLD_PICTURE:
+        return f"picture {health.age:.1f} s old" + (f" · {so_far}" if so_far else ""), Tone.WARN
+    return so_far, Tone.IDLE
 
 
 def arm_word(status: RobotStatus | None, person: bool = False) -> tuple[str, Tone]:

@@ -73,6 +73,7 @@ def measure(options: CriticOptions) -> dict[str, Any]:
     from far_app.cli.assemble import assemble, shipped, trained
     from far_app.cli.lockstep_twin import lockstep_twin
     from far_app.detectors import TwinCheck
+    from far_app.learning.memory import FeatureMemory
     from far_app.learning.pairs import explored
     from far_app.methods.evidence import history
     from far_app.seeding import generator
@@ -113,7 +114,7 @@ def measure(options: CriticOptions) -> dict[str, Any]:
                     features = network.encode(seen)
                     chunks = network.sample(features.expand(options.samples, -1), torch.from_numpy(noise))
                     chunks = explored(chunks[None], options.explore, rng)[0]
-                    scores = judge.q(judge.see(seen, features).expand(options.samples, -1), chunks)
+                    scores = judge.q(judge.see(seen, features, FeatureMemory()).expand(options.samples, -1), chunks)
                 ahead = robot.scale.translation * chunks[:, :, :3].clamp(-1, 1).sum(1).numpy()
                 states.append(Ranking.of(offset(attempt, tick), ahead, scores.numpy()))
     if not states:

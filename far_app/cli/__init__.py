@@ -11,6 +11,7 @@ from far_app.errors import FarError
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("far_app.cli.run", "supervised trials: try, notice failure, learn, retry; with the operator page"),
+    "trials": ("far_app.cli.trials", "a plan of trials: methods × scenes, compared fairly; goes on where it stopped"),
     "hw-server": ("far_app.cli.hw_server", "own the arm on a machine of its own, for far run --hw on another"),
     "keys": ("far_app.cli.keys", "make the keys with which two machines trust each other"),
     "demo": ("far_app.cli.demo", "make demonstrations with the scripted expert"),
@@ -33,8 +34,14 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "policy list": ("far_app.cli.policy_list", "the adapted policy versions a session kept, and their lineage"),
     "policy promote": ("far_app.cli.policy_promote", "an adapted version as a checkpoint of its own"),
     "bench loop": ("far_app.bench.loop", "lateness of the 30 Hz loop, idle and adapting"),
+    "bench render": ("far_app.bench.render", "milliseconds to draw the twin's cameras"),
     "bench page": ("far_app.bench.page", "what open pages cost: the loop's lateness, the page's memory over a day"),
-    "bench infer": ("far_app.bench.infer", "milliseconds per chunk, by preset"),
+    "bench infer": ("far_app.bench.infer", "milliseconds per chunk, by preset and engine, and how they grow"),
+    "bench precision": ("far_app.bench.precision", "does an engine of lower precision cost successes"),
+    "bench train": ("far_app.bench.train", "gradient steps a second, plain and fast"),
+    "bench evaluate": ("far_app.bench.evaluate", "policy ticks a second of lockstep trials, and where the time goes"),
+    "bench start": ("far_app.bench.start", "seconds to the list of commands and to the first motion"),
+    "bench all": ("far_app.bench.everything", "every benchmark of speed, and docs/performance.md made of them"),
     "bench adapt": ("far_app.bench.adapt", "seconds from a failed attempt to a new policy version, by stage"),
     "bench critic": ("far_app.bench.critic", "can Q rank what the policy would do: before trusting FAR with a model"),
     "bench success": ("far_app.bench.success", "a success detector against the twin's own check, on held-out attempts"),

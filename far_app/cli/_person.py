@@ -55,6 +55,6 @@ class NoMethod:
 def person_parts(task: TaskConfig, image_size: int) -> Parts:
     """What far_app/cli/stage.py needs where nobody but a person acts."""
     return Parts(
-        method=NoMethod(task, image_size), policy_name=VERSION, max_attempts=1,
+        method=NoMethod(task, image_size), policy_name=VERSION, checkpoint=None, max_attempts=1,
         another=lambda: NoMethod(task, image_size),
     )  # fmt: skip

@@ -15,8 +15,10 @@ from far_app.types import Observation
 
 if TYPE_CHECKING:
     from far_app.learning.critic import Critic
-    from far_app.learning.engines import Engine
+    from far_app.learning.engines import Choice
+    from far_app.learning.memory import FeatureMemory
     from far_app.learning.policy import DiffusionPolicy
+    from far_app.learning.runtime import ActingPolicy
     from far_app.learning.steering import Steering
     from far_app.methods.retry import Act
 
@@ -37,6 +39,8 @@ class Parts:
     """Checkpoint, for people and the recording."""
     max_attempts: int | None
     """Attempts a trial where the method fixes them."""
+    checkpoint: str | None
+    """As it was asked for; None for the shipped one."""
     another: Callable[[], Method]
     """One more method of the same parts, for a trial beside; the base policy is shared, so that they plan together."""
 
@@ -61,8 +65,13 @@ class Model:
     critic_file: Path | None
     """None where the weights are random."""
     name: str
+    checkpoint: str | None
+    """As it was asked for; None for the shipped one."""
     act: Act
     """Makes acting policies; the base policy is one object for all, so that trials plan together."""
+    base: ActingPolicy
+    memory: FeatureMemory
+    """What they have seen."""
 
 
 def assemble(
@@ -72,17 +81,20 @@ def assemble(
     critic: Path | None,
     device: str,
     retry: RetryConfig,
-    engine: Engine = "auto",
+    engine: str = "auto",
     lanes: int | None = None,
+    threads: int = 1,
 ) -> Parts:
-    """Load what a method needs and warm it up; `lanes`: trials that will share the base policy's batches. Raises
-    ConfigError or CheckpointError."""
+    """Load what a method needs and warm it up; `lanes`: trials that will share the base policy's batches; `threads`: of
+    one torch operation. Raises ConfigError or CheckpointError."""
     if policy is not None and policy.startswith("test:"):
         from far_app.cli._scripted import ScriptedMethod
 
         scripted = ScriptedMethod(policy.removeprefix("test:"))
-        return Parts(method=scripted, policy_name=policy, max_attempts=None, another=lambda: scripted)
-    return equip(load_model(policy, critic, task.name, device, [method], engine, lanes), method, retry)
+        return Parts(
+            method=scripted, policy_name=policy, max_attempts=None, checkpoint=policy, another=lambda: scripted
+        )
+    return equip(load_model(policy, critic, task.name, device, [method], engine, lanes, threads), method, retry)
 
 
 def load_model(
@@ -91,10 +103,13 @@ def load_model(
     task: str,
     device: str,
     methods: Sequence[str],
-    engine: Engine = "auto",
+    engine: str = "auto",
     lanes: int | None = None,
+    threads: int = 1,
 ) -> Model:
-    """The networks that these methods need. Raises ConfigError or CheckpointError."""
+    """The networks that these methods need. "auto" takes the fastest engine of this machine, and with `lanes` the first
+    that runs, for comparisons must repeat. Raises ConfigError or CheckpointError."""
+    from far_app.learning.memory import FeatureMemory
     from far_app.learning.runtime import ActingPolicy
     from far_app.methods import METHODS
     from far_app.methods.retry import BASE_VERSION
@@ -111,18 +126,32 @@ def load_model(
         name = f"shipped: {path.name}" if policy is None else str(path)
         needed = any(METHODS[m].needs_critic for m in methods)
         network, critic_network = trained(path, beside, task, device, needed)
-    base: dict[str, ActingPolicy] = {}
+    memory, choice = FeatureMemory(), engine_choice(engine, network, lanes, threads)
+    base = ActingPolicy(network, BASE_VERSION, critic_network, choice, batch=lanes, memory=memory)
 
     def act(network: DiffusionPolicy, version: str, steering: Steering | None = None) -> ActingPolicy:
-        if version == BASE_VERSION and version in base:
-            return base[version]
-        batch = lanes if version == BASE_VERSION else None
-        policy = ActingPolicy(network, version, critic_network, engine, steering, batch)
         if version == BASE_VERSION:
-            base[version] = policy
-        return policy
+            return base
+        return ActingPolicy(network, version, critic_network, choice, steering, memory=memory, base=base)
 
-    return Model(network=network, critic=critic_network, critic_file=beside, name=name, act=act)
+    return Model(
+        network=network,
+        critic=critic_network,
+        critic_file=beside,
+        name=name,
+        checkpoint=policy,
+        act=act,
+        memory=memory,
+        base=base,
+    )
+
+
+def engine_choice(engine: str, network: DiffusionPolicy, lanes: int | None, threads: int) -> Choice:
+    """Engines to try for this network. Raises ConfigError."""
+    from far_app.learning.engines import order_of
+    from far_app.learning.engines.choice import fastest
+
+    return fastest(network, threads) if engine == "auto" and lanes is None else order_of(engine, network)
 
 
 def equip(model: Model, method: str, retry: RetryConfig) -> Parts:
@@ -137,11 +166,12 @@ def equip(model: Model, method: str, retry: RetryConfig) -> Parts:
             demonstrations = load_demonstrations(model.critic_file, model.network)
         retry = with_threshold(retry, model.critic_file)
     ingredients = Ingredients(
-        network=model.network, critic=model.critic, config=retry, demonstrations=demonstrations, act=model.act
-    )
+        network=model.network, critic=model.critic, config=retry, demonstrations=demonstrations, act=model.act,
+        memory=model.memory,
+    )  # fmt: skip
     return Parts(
         method=make_method(method, ingredients), policy_name=model.name, max_attempts=entry.attempts,
-        another=lambda: make_method(method, ingredients),
+        checkpoint=model.checkpoint, another=lambda: make_method(method, ingredients),
     )  # fmt: skip
 
 

@@ -41,6 +41,8 @@ def main(arguments: Sequence[str]) -> int:
     """Exit status 1 when something needed is lacking."""
     parser = argparse.ArgumentParser(prog="far doctor", description="What this machine has, and what to do about it.")
     parser.add_argument("--port", type=int, default=8080, help="the page's port")
+    parser.add_argument("--policy", help="checkpoint whose engine is told; the shipped model by default")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda, for the engine")
     parser.add_argument("--recordings", type=Path, default=Path("recordings"))
     parser.add_argument(
         "--rig", help="check this rig file (name or path) instead, and its controller where one answers"
@@ -58,7 +60,7 @@ def main(arguments: Sequence[str]) -> int:
         ("CPU", cpu),
         ("GPU", gpu),
         ("torch", torch_device),
-        ("engine", engine),
+        ("engine", lambda: engine(options.policy, options.device)),
         ("GL", graphics),
         ("timer", timer),
         ("disk", lambda: disk(options.recordings)),
@@ -139,17 +141,17 @@ def torch_device() -> Finding:
     return Finding(good=True, text=f"{torch.__version__}, device {device}, {torch.get_num_threads()} threads")
 
 
-def engine() -> Finding:
-    from far_app.learning import engines, openvino_unet
+def engine(policy: str | None, device: str) -> Finding:
+    """What a run of this policy would take: measured, built and checked as a run does it."""
+    from far_app.cli.assemble import load_model
+    from far_app.learning.engines import ENGINES
 
-    if openvino_unet.available():
-        version = importlib.metadata.version("openvino")
-        return Finding(
-            good=True, text=f"a run on this CPU takes {engines.chosen()} {version}; --engine torch overrides"
-        )
+    model = load_model(policy, None, "lift", device, ["nr"])
+    taken = model.base.runs_on
+    absent = [f"{n} ({why})" for n, e in ENGINES.items() if (why := e.unusable(model.network))]
     return Finding(
-        good=True, text="a run on this CPU takes torch; OpenVINO is not installed",
-        advice="pip install openvino makes inference faster (10 ms a chunk in place of 17 on two cores)",
+        good=not taken.refused, text=f"a run of {model.name} takes {taken.name} ({taken.why})",
+        advice="; ".join([f"refused: {r}" for r in taken.refused] + [f"not here: {', '.join(absent)}"] * bool(absent)),
     )  # fmt: skip
 
 

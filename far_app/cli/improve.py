@@ -25,7 +25,7 @@ from far_app.cli.settings import Settings, parse
 from far_app.config import RetryConfig, TaskConfig
 from far_app.errors import ConfigError
 from far_app.evaluation import REPORT_SCENES, Arm, EvaluationPlan, differences, identity, read_results
-from far_app.improvement import Collector, Epoch, Improvement, Noisy, read_log, table
+from far_app.improvement import Collector, Epoch, Improvement, Noisy, before_and_after, read_log, table
 from far_app.tasks import task as find_task
 from hw.rig import load_rig
 
@@ -67,11 +67,50 @@ def main(arguments: Sequence[str]) -> int:
     options = parse(ImproveOptions, arguments, "far improve")
     task = find_task(options.task, load_rig(options.rig).arm)
     policy, critic = checkpoints(task.name, options.policy, options.critic)
+    if options.sessions:
+        check_sessions(options, policy)
     folder = options.out or Path("runs") / f"improve-{task.name}-{options.collector}-{options.loop.seed}"
     claim(folder, options, policy, critic)
     run(options, task, folder, policy, critic)
     print(table(read_log(folder / "log.jsonl")))
+    if options.sessions:
+        before, after = (read_results(folder / f"epoch-{n:02d}" / "evaluation" / "episodes.jsonl") for n in (0, 1))
+        print(f"\n{before_and_after(before, after)}")
+        print(
+            f"the finetuned policy is {folder / 'epoch-01' / 'policy.safetensors'}; the one it began from is untouched"
+        )
     return 0
+
+
+def check_sessions(options: ImproveOptions, policy: Path) -> None:
+    """ConfigError, before the first evaluation takes its minutes, where sessions hold nothing to learn from, pictures
+    of another size than the policy's, or scenes that the evaluation is about to judge on."""
+    from far_app.learning.policy import load_policy
+    from far_app.recording.episodes import session_episodes
+    from far_app.recording.reader import read_session
+
+    config = load_policy(policy, options.task).config
+    judged = range(REPORT_SCENES, REPORT_SCENES + options.loop.evaluation_scenes)
+    for path in options.sessions:
+        episodes = session_episodes(path, options.task)
+        if not episodes:
+            raise ConfigError(f"--from {path}: no attempt of it ended, there is nothing to learn from")
+        twin = read_session(path).header.info.rig.get("robot") == "twin"
+        if twin and (seen := sorted({e.seed for e in episodes} & set(judged))):
+            raise ConfigError(
+                f"--from {path}: its scene {seen[0]} is one that before and after are judged on ({judged.start} to "
+                f"{judged.stop - 1}); leave the session out, or judge on fewer (--loop.evaluation-scenes)"
+            )
+        for camera in config.cameras:
+            images = episodes[0].images.get(camera)
+            if images is None or images.shape[1:3] != (config.image_size, config.image_size):
+                found = "no pictures" if images is None else f"pictures of {images.shape[2]}×{images.shape[1]}"
+                raise ConfigError(
+                    f"--from {path}: {found} of camera '{camera}', the policy {policy} sees {config.image_size}×"
+                    f"{config.image_size}; give sessions that were recorded with this policy's rig"
+                )
+    if not (data := options.data or Path("datasets") / f"{options.task}.hdf5").exists():
+        raise ConfigError(f"no demonstrations at {data}; give those the policy learnt from with --data (far demo)")
 
 
 def claim(folder: Path, options: ImproveOptions, policy: Path, critic: Path) -> None:

@@ -45,8 +45,9 @@ class RunOptions:
     """Critic checkpoint; the one beside the policy by default."""
     device: str = "cpu"
     """cpu or cuda."""
-    engine: Literal["auto", "torch", "openvino"] = "auto"
-    """What runs the policy on a CPU; auto takes OpenVINO where it is installed, and torch, the reference, elsewhere."""
+    engine: Literal["auto", "torch", "arranged", "openvino", "openvino-bf16", "cuda-graph"] = "auto"
+    """What runs the policy; auto takes the fastest of this machine (`far doctor` says which), torch is the
+    reference."""
     max_attempts: int | None = None
     """Attempts a trial; the task's by default."""
     port: int = 8080

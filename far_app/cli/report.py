@@ -24,6 +24,8 @@ class ReportOptions:
     report_SESSION.html here."""
     overwrite: bool = False
     """Replace a page that exists."""
+    unblind: bool = False
+    """Name the methods of a blinded plan that is not done yet."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -36,7 +38,7 @@ def main(arguments: Sequence[str]) -> int:
             raise ConfigError("one folder of results at a time; several recorded sessions can share a page")
         print(write_report(folders[0], options.out or folders[0]))
     else:
-        print(write_page(folders, options.out, options.overwrite))
+        print(write_page(folders, options.out, options.overwrite, options.unblind))
     return 0
 
 
@@ -47,7 +49,7 @@ def results_in(folder: Path) -> bool:
     return (folder / "plan.json").exists() or any(folder.glob("*/plan.json"))
 
 
-def write_page(folders: Sequence[Path], out: Path | None, overwrite: bool) -> Path:
+def write_page(folders: Sequence[Path], out: Path | None, overwrite: bool, unblind: bool) -> Path:
     """Where the page of these sessions is."""
     from far_app.exchange.target import whole
     from far_app.recording.inspect import find_session
@@ -56,7 +58,7 @@ def write_page(folders: Sequence[Path], out: Path | None, overwrite: bool) -> Pa
     sessions = list(dict.fromkeys(find_session(folder) for folder in folders))
     target = out or Path(f"report_{sessions[0].resolve().name}.html")
     with whole(target, overwrite) as half:
-        half.write_text(page(sessions), encoding="utf-8")
+        half.write_text(page(sessions, unblind=unblind), encoding="utf-8")
     return target
 
 

@@ -13,10 +13,12 @@ from typing import Any
 
 from far_app.cli.options import RunOptions
 from far_app.cli.settings import parse
-from far_app.cli.stage import stage
+from far_app.cli.stage import Stage, stage
 from far_app.config import RetryConfig
 from far_app.endpoints import Endpoints
 from far_app.errors import ConfigError
+from far_app.recording.writer import SessionWriter
+from far_app.session.course import Course
 from far_app.session.inbox import IntentInbox
 from far_app.session.settings import TrialResult
 from far_app.session.statistics import LoopStatistics
@@ -65,24 +67,30 @@ def run(options: RunOptions) -> tuple[list[TrialResult], LoopStatistics]:
     """One session. Raises the FarError that ended it; the arm is held and the recording closed by then."""
     statistics = LoopStatistics()
     with Ending() as ending, stage(options) as stage_:
-        writer = stage_.writer()
-        if stage_.page_url:
-            print(f"The operator page is at {stage_.page_url}", flush=True)
-        print(f"Recording to {writer.folder}", flush=True)
-        inbox = IntentInbox(Endpoints.in_folder(stage_.folder).intents)
-        ending.tell(inbox)
-        try:
-            with stage_.session(writer, inbox, statistics) as session:
-                session.run()
-        except SessionFault as fault:
-            if stage_.hardware is not None:
-                stage_.hardware.check(f"{fault}; ")
-            raise
-        finally:
-            inbox.close()
-        if session.recorder.error is not None:
-            raise session.recorder.error
-        return session.results, statistics
+        return supervise(stage_, stage_.writer(), ending, statistics), statistics
+
+
+def supervise(
+    stage_: Stage, writer: SessionWriter, ending: Ending, statistics: LoopStatistics, course: Course | None = None
+) -> list[TrialResult]:
+    """Run the session on a stage that stands. Raises the FarError that ended it."""
+    if stage_.page_url:
+        print(f"The operator page is at {stage_.page_url}", flush=True)
+    print(f"Recording to {writer.folder}", flush=True)
+    inbox = IntentInbox(Endpoints.in_folder(stage_.folder).intents)
+    ending.tell(inbox)
+    try:
+        with stage_.session(writer, inbox, statistics, course=course) as session:
+            session.run()
+    except SessionFault as fault:
+        if stage_.hardware is not None:
+            stage_.hardware.check(f"{fault}; ")
+        raise
+    finally:
+        inbox.close()
+    if session.recorder.error is not None:
+        raise session.recorder.error
+    return session.results
 
 
 class Ending(contextlib.AbstractContextManager["Ending"]):

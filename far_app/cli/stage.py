@@ -13,7 +13,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -29,12 +29,13 @@ from far_app.cli.processes import Child, Family, run_folder
 from far_app.config import TaskConfig
 from far_app.detectors import PersonJudge, TwinCheck
 from far_app.endpoints import Endpoints, note_elsewhere
-from far_app.errors import FarError, RobotError
+from far_app.errors import ArmTaken, FarError, RobotError
 from far_app.link import RemoteRobot
 from far_app.protocols import Method, PlanRequest, Policy, SuccessDetector
 from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
 from far_app.scheduling import PROMPT_NICENESS, nice
+from far_app.session.course import Course
 from far_app.session.inbox import IntentInbox
 from far_app.session.planners import ThreadedPlanner, plan_one
 from far_app.session.publisher import TelemetryPublisher
@@ -48,6 +49,7 @@ from far_app.session.statistics import LoopStatistics
 from far_app.station import station_at
 from far_app.tasks import supervised
 from far_app.tasks import task as find_task
+from far_app.trial_plan.plan import TrialPlan
 from hw.camera_config import with_views
 from hw.rig import RigConfig
 from hw.setup import setup_of
@@ -70,7 +72,8 @@ class Stage:
     options: RunOptions
     task: TaskConfig
     rig: RigConfig
-    parts: Parts
+    methods: Mapping[str, Parts]
+    """What may act, by the name it has here; one but for a plan."""
     robot: RemoteRobot
     folder: Path
     family: Family
@@ -79,16 +82,22 @@ class Stage:
     page: Child | None
     page_url: str
 
-    def writer(self) -> SessionWriter:
+    @property
+    def parts(self) -> Parts:
+        """What acts, or the first of a plan."""
+        return next(iter(self.methods.values()))
+
+    def writer(self, plan: TrialPlan | None = None) -> SessionWriter:
         """A new recording of what this stage is made of. Raises RecordingError."""
         options = self.options
+        planned = {"plan": plan.record()} if plan is not None else {}
         return SessionWriter(
             options.recordings,
             SessionInfo(
-                task=self.task.name, method=options.method, rig=dataclasses.asdict(self.rig),
+                task=self.task.name, method=plan.name if plan else options.method, rig=dataclasses.asdict(self.rig),
                 policy=self.parts.policy_name, seed=options.seed, cameras=self.parts.method.policy.spec.cameras,
                 rate=self.task.rate,
-                config={"run": dataclasses.asdict(options), "task": dataclasses.asdict(self.task)},
+                config={"run": dataclasses.asdict(options), "task": dataclasses.asdict(self.task), **planned},
             ),
         )  # fmt: skip
 
@@ -119,10 +128,10 @@ class Stage:
     @contextlib.contextmanager
     def session(
         self, writer: SessionWriter, inbox: IntentInbox, statistics: LoopStatistics, method: Method | None = None, *,
-        demonstrate: Literal["", "teleop", "hand"] = "", keep: Keep = drop,
+        course: Course | None = None, demonstrate: Literal["", "teleop", "hand"] = "", keep: Keep = drop,
     ) -> Iterator[Session]:  # fmt: skip
-        """A session on this stage, with the page told about it and revived when it dies; of attempts, or of a person's
-        demonstrations."""
+        """A session on this stage, with the page told about it and revived when it dies; of attempts, of a plan's
+        (`course`), or of a person's demonstrations."""
         options = self.options
         publisher = None
         if options.rerun:
@@ -141,7 +150,7 @@ class Stage:
                     robot=robot, planner=ThreadedPlanner(), method=method or self.parts.method,
                     detector=detector, task=self.task, scale=self.rig.scale_for(self.task),
                     recorder=Recorder(writer), inbox=inbox, statistics=statistics, publisher=publisher,
-                    alarm=failure_alarm(options), keep=keep,
+                    alarm=failure_alarm(options), course=course, keep=keep,
                 )  # fmt: skip
                 if options.shadow:
                     session.standing.say("shadow run: plans are shown, the arm is held", "warning")
@@ -151,8 +160,20 @@ class Stage:
                 publisher.close()
 
 
+Assembling = Callable[[RunOptions, TaskConfig], Mapping[str, Parts]]
+
+
+def one_method(options: RunOptions, task: TaskConfig) -> Mapping[str, Parts]:
+    """What the options themselves ask for."""
+    parts = assemble(
+        options.method, task, options.policy, options.critic, options.device, options.retry, options.engine,
+        threads=options.torch_threads,
+    )  # fmt: skip
+    return {options.method: parts}
+
+
 @contextlib.contextmanager
-def stage(options: RunOptions, person: bool = False) -> Iterator[Stage]:
+def stage(options: RunOptions, assembling: Assembling = one_method, *, person: bool = False) -> Iterator[Stage]:
     """Start everything, wait until it is ready, end everything. `person`: nobody else acts, no policy is loaded. Raises
     the FarError of whatever cannot start."""
     rig = options.load_rig()
@@ -165,9 +186,8 @@ def stage(options: RunOptions, person: bool = False) -> Iterator[Stage]:
         stack.callback(family.end)
         hardware, rig = find_hardware(folder, family, options, rig)
         page = None if options.headless else family.add(start_page(folder, options, port, task.cameras))
-        parts = person_parts(task, rig.policy_image) if person else assemble(
-            options.method, task, options.policy, options.critic, options.device, options.retry, options.engine
-        )  # fmt: skip
+        methods = {"": person_parts(task, rig.policy_image)} if person else assembling(options, task)
+        parts = next(iter(methods.values()))
         attempts = options.max_attempts or parts.max_attempts or task.max_attempts
         task = dataclasses.replace(task, max_attempts=1 if options.shadow else attempts)
         # From here on this process's threads come before the machine's others: one that is not scheduled while it holds
@@ -177,16 +197,18 @@ def stage(options: RunOptions, person: bool = False) -> Iterator[Stage]:
         robot = stack.enter_context(connected(folder, hardware))
         if page is not None:
             wait_for_page(page, options.page_host, port)
-        check_observation(parts.method.policy.spec, robot.observe())
-        if not person:
-            preflight(
-                parts.method.policy.spec, policy_card(task.name, options.policy), setup_of(rig, task), robot.observe(),
-                options.accept_differences or options.shadow,
-            )  # fmt: skip
+        for parts in methods.values():
+            check_observation(parts.method.policy.spec, robot.observe())
+            if not person:
+                preflight(
+                    parts.method.policy.spec, policy_card(task.name, parts.checkpoint), setup_of(rig, task),
+                    robot.observe(), options.accept_differences or options.shadow,
+                )  # fmt: skip
         prepare_process(options.torch_threads)
-        warm_up(parts.method.policy, robot)
+        for parts in methods.values():
+            warm_up(parts.method.policy, robot)
         yield Stage(
-            options=options, task=task, rig=rig, parts=parts, robot=robot, folder=folder, family=family,
+            options=options, task=task, rig=rig, methods=methods, robot=robot, folder=folder, family=family,
             hardware=hardware, page=page, page_url=access.url(port) if access is not None else "",
         )  # fmt: skip
 
@@ -230,6 +252,8 @@ def connected(folder: Path, hardware: Child | None) -> Iterator[RemoteRobot]:
             hardware.check()
         try:
             robot = RemoteRobot(Endpoints.in_folder(folder), connect_timeout=1.0 if hardware is not None else 5.0)
+        except ArmTaken:
+            raise
         except RobotError as error:
             if time.monotonic() > deadline:
                 raise RobotError(

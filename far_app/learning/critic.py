@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from far_app.learning.memory import FeatureMemory
 from far_app.learning.policy import DiffusionPolicy
 from far_app.protocols import History
 
@@ -74,9 +75,14 @@ class Critic(nn.Module):
         self.register_buffer("mean", torch.zeros(shape.features))
         self.register_buffer("std", torch.ones(shape.features))
 
-    def see(self, histories: Sequence[History], features: Float[Tensor, "B F"]) -> Float[Tensor, "B F"]:
+    def see(
+        self, histories: Sequence[History], features: Float[Tensor, "B F"], memory: FeatureMemory
+    ) -> Float[Tensor, "B F"]:
         """What `value` and `q` take, from histories and the policy's features of them."""
-        return features if self.eyes is None else self.eyes.encode(histories)
+        eyes = self.eyes
+        if eyes is None:
+            return features
+        return memory.of(histories, lambda new: torch.cat([eyes.encode([h]) for h in new]), eyes="critic")
 
     def standardise(self, features: Float[Tensor, "N F"]) -> None:
         """Fix the input statistics, before training; entries that hardly vary are left unscaled."""

@@ -61,7 +61,7 @@ def ddim_sample(
     features: Float[Tensor, "B F"],
     noise: Float[Tensor, "B H A"],
     count: int,
-    push: Callable[[Float[Tensor, "B H A"]], Float[Tensor, "B H A"]] = lambda clean: clean,
+    push: Callable[[Float[Tensor, "B H A"]], Float[Tensor, "B H A"]] | None = None,
 ) -> Float[Tensor, "B H A"]:
     """Chunks denoised from the given noise in `count` deterministic steps; `push` may move each step's estimate of the
     clean chunks."""
@@ -69,7 +69,9 @@ def ddim_sample(
     for k, root_a, root_na, root_b, root_nb in ddim_coefficients(count):
         steps = torch.full((x.shape[0],), k, device=x.device, dtype=torch.long)
         epsilon = denoiser(x, steps, features)
-        clean = push(((x - root_na * epsilon) / root_a).clamp(-1.0, 1.0)).clamp(-1.0, 1.0)
+        clean = ((x - root_na * epsilon) / root_a).clamp(-1.0, 1.0)
+        if push is not None:
+            clean = push(clean).clamp(-1.0, 1.0)
         epsilon = (x - root_a * clean) / root_na
         x = root_b * clean + root_nb * epsilon
     return x

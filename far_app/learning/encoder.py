@@ -44,7 +44,15 @@ class LightCamera(nn.Module):
         self.dim = 2 * maps
 
     def forward(self, image: Float[Tensor, "B 3 S S"]) -> Float[Tensor, "B D"]:
-        return self.softmax(self.net(image))
+        return self.positions(self.maps(image))
+
+    def maps(self, image: Float[Tensor, "B 3 S S"]) -> Float[Tensor, "B C H W"]:
+        """All convolutions."""
+        return self.net(image)
+
+    def positions(self, maps: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D"]:
+        """What follows them."""
+        return self.softmax(maps)
 
 
 class BasicBlock(nn.Module):
@@ -106,10 +114,17 @@ class ResNet18Camera(nn.Module):
         self.dim = out
 
     def forward(self, image: Float[Tensor, "B 3 S S"]) -> Float[Tensor, "B D"]:
+        return self.positions(self.maps(image))
+
+    def maps(self, image: Float[Tensor, "B 3 S S"]) -> Float[Tensor, "B C H W"]:
+        """All convolutions."""
         x = ((image + 1.0) / 2.0 - self.mean) / self.std
         x = self.maxpool(torch.relu(self.bn1(self.conv1(x))))
-        x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
-        return self.head(self.softmax(self.keypoints(x)))
+        return self.keypoints(self.layer4(self.layer3(self.layer2(self.layer1(x)))))
+
+    def positions(self, maps: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D"]:
+        """What follows them."""
+        return self.head(self.softmax(maps))
 
 
 class ObservationEncoder(nn.Module):
@@ -129,6 +144,11 @@ class ObservationEncoder(nn.Module):
         self.nets = nn.ModuleDict({c: nn.ModuleList(make() for _ in range(count)) for c in cameras})
         self.frame_dim: int = self._net(cameras[0], 0).dim if cameras else 0
         self.dim = n_obs * (len(cameras) * self.frame_dim + state_dim)
+
+    def networks(self, camera: str) -> list[Any]:
+        """Of a camera: one for each place in the history, oldest first, or one for all."""
+        nets: Any = self.nets[camera]
+        return list(nets)
 
     def _net(self, camera: str, index: int) -> Any:
         nets: Any = self.nets[camera]

@@ -51,7 +51,7 @@ def _mish(x: Tensor) -> Tensor:
 
 
 def mish(x: Tensor) -> Tensor:
-    if x.numel() < 4096:
+    if x.is_cuda or x.numel() < 4096:
         return functional.mish(x)
     return _Mish.apply(x) if x.requires_grad else _mish(x)  # type: ignore[return-value]
 
@@ -80,13 +80,18 @@ def upsampling_matrix(weight: Float[Tensor, "C O 4"]) -> Float[Tensor, "3C 2O"]:
     return torch.cat([torch.cat([w3, zero], dim=1), torch.cat([w1, w2], dim=1), torch.cat([zero, w0], dim=1)], dim=0)
 
 
-def arrangeable(module: nn.Module, horizon: int) -> ConditionalUnet1d | None:
-    """The module as a U-Net that FastUnet can run: on CPU, kernel 3, a horizon that halves evenly at every level."""
+def fits(module: nn.Module, horizon: int) -> ConditionalUnet1d | None:
+    """The module as a U-Net that FastUnet can run: kernel 3, a horizon that halves evenly at every level."""
     if not isinstance(module, ConditionalUnet1d) or horizon % 2 ** (len(module.downs) - 1):
         return None
     u: Any = module
-    first = u.downs[0][0].first[0].weight
-    return module if first.device.type == "cpu" and first.shape[2] == 3 else None
+    return module if u.downs[0][0].first[0].weight.shape[2] == 3 else None
+
+
+def arrangeable(module: nn.Module, horizon: int) -> ConditionalUnet1d | None:
+    """One that it runs faster than the module runs itself: on a CPU."""
+    fitting = fits(module, horizon)
+    return fitting if fitting is not None and next(fitting.parameters()).device.type == "cpu" else None
 
 
 class FastUnet:
@@ -155,11 +160,13 @@ class FastUnet:
         self, noisy: Float[Tensor, "B H A"], k: Int[Tensor, "B"], condition: Float[Tensor, "B M"]
     ) -> Float[Tensor, "B H A"]:
         """ε_θ(a_k, s, k), the observation given by its `condition`."""
+        return self.filmed(noisy, self.leaves[0][k] + condition)
+
+    def filmed(self, noisy: Float[Tensor, "B H A"], film: Float[Tensor, "B M"]) -> Float[Tensor, "B H A"]:
+        """The same, given what scales and shifts every block."""
         u: Any = self.unet
-        matrices = iter(self.leaves)
-        film = (next(matrices)[k] + condition)[:, None]
-        next(matrices)
-        films = iter(film.split([2 * b.second[1].num_channels for b in self._blocks()], dim=2))
+        matrices = iter(self.leaves[2:])
+        films = iter(film[:, None].split([2 * b.second[1].num_channels for b in self._blocks()], dim=2))
         x = noisy
         skips: list[Tensor] = []
         for first, second, shrink in u.downs:

@@ -22,7 +22,7 @@ from far_app.learning.adamw import FlatAdamW, guarded_step
 from far_app.learning.cancellation import Cancelled
 from far_app.learning.pairs import Pairs
 from far_app.learning.preference import Demonstrations, Noising, Objective, draw
-from far_app.learning.trainable import trainable
+from far_app.learning.trainable import Arrange, trainable
 from far_app.types import AdaptationStep
 
 FIXED_DRAWS = 2
@@ -60,12 +60,14 @@ def adapt(
     cancelled: Cancelled,
     progress: Callable[[AdaptationStep], None],
     demonstrations: Demonstrations | None = None,
+    arrange: Arrange = trainable,
 ) -> Update:
     """FCPA on these pairs, in place; `denoiser` is the caller's private copy of the weights that acted, in eval mode.
+    `arrange` says how it is run: the quickest way, or plainly.
     Progress is told before the first step (step 0) and after each. Raises AdaptationCancelledError on cancellation;
     the copy is then of no use."""
     check_config(config, demonstrations)
-    runner = trainable(denoiser, horizon=pairs.negatives.shape[1])
+    runner = arrange(denoiser, pairs.negatives.shape[1])
     objective = Objective(runner, noising, pairs, config, cancelled)
     states = len(pairs.features)
     fixed = draw(rng, states, FIXED_DRAWS, noising.steps, pairs.negatives)

@@ -1,12 +1,11 @@
 """The policy that acts: a DiffusionPolicy, its version, and the critic's V(s_t), behind far_app.protocols.Policy.
 
-An observation's camera features are computed once, where the encoder shares its weights over the frames: the next tick
-finds the previous frame's already there. Noise comes from outside, so that methods and runs can be compared.
+An engine (far_app/learning/engines) runs the network. Noise comes from outside, so that methods and runs can be
+compared; features go to a memory that the critic and the adaptation share.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,15 +15,12 @@ from torch import Tensor
 
 from far_app.errors import PolicyError
 from far_app.learning.critic import Critic
-from far_app.learning.diffusion import ddim_sample
-from far_app.learning.engines import Engine, runner
+from far_app.learning.engines import Choice, order_of, take
+from far_app.learning.memory import FeatureMemory
 from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.steering import Steering, more_noise
-from far_app.protocols import History, PolicySpec
-from far_app.types import ActionChunk, Observation
-
-KEPT_FRAMES = 64
-"""Observations whose camera features are kept: a history each for a few dozen robots."""
+from far_app.protocols import EngineReport, History, PolicySpec
+from far_app.types import ActionChunk
 
 
 class ActingPolicy:
@@ -35,18 +31,30 @@ class ActingPolicy:
         network: DiffusionPolicy,
         version: str,
         critic: Critic | None = None,
-        engine: Engine = "auto",
+        engine: str | Choice = "auto",
         steering: Steering | None = None,
         batch: int | None = None,
+        memory: FeatureMemory | None = None,
+        base: ActingPolicy | None = None,
     ) -> None:
         """`batch`: plan in batches of exactly so many, the last one filled up. A matrix product rounds differently in
-        another shape, and a chunk must not depend on what it happens to be planned beside."""
+        another shape, and a chunk must not depend on what it happens to be planned beside. `memory`: shared with others
+        that look through the same encoder. `base`: the policy this one was adapted from, whose engine goes on."""
         self.batch = batch
         self.network, self.critic, self.version, self.steering = network, critic, version, steering
+        self.memory = memory or FeatureMemory()
         self.spec: PolicySpec = network.spec()
         self.device = network.normalizer.low.device
-        self._denoiser = runner(network.denoiser, network.config.horizon, engine)
-        self._kept: OrderedDict[int, tuple[Observation, list[Tensor]]] = OrderedDict()
+        choice = engine if isinstance(engine, Choice) else order_of(engine, network)
+        self._taken = take(
+            network, version, choice, each_alone=batch is not None, batch=batch or 1,
+            base=base._taken if base is not None else None,
+        )  # fmt: skip
+
+    @property
+    def runs_on(self) -> EngineReport:
+        """far_app.protocols.RunsOnEngine."""
+        return self._taken.report
 
     def plan(
         self, histories: Sequence[History], ticks: Sequence[int], noise: Float[np.ndarray, "B H A"]
@@ -64,14 +72,19 @@ class ActingPolicy:
         self, histories: Sequence[History], ticks: Sequence[int], noise: Float[np.ndarray, "B H A"]
     ) -> list[ActionChunk]:
         """In one batch."""
-        with torch.inference_mode():
-            features = self.features(histories)
-            condition = self._denoiser.condition(features)
+        engine = self._taken.engine
+        with torch.no_grad():
             start = torch.from_numpy(np.ascontiguousarray(noise, np.float32)).to(self.device)
-            chunks = ddim_sample(self._denoiser.run, condition, start, self.network.config.ddim_steps).cpu().numpy()
+            if self.memory.known(histories):
+                features = self.memory.of(histories, engine.encode)
+                sampled = engine.sample(features, start)
+            else:
+                features, sampled = engine.plan(histories, start)
+                self.memory.keep(histories, features)
+            chunks = sampled.cpu().numpy()
             values, shown = np.full(len(ticks), np.nan), features
             if self.critic is not None:
-                shown = self.critic.see(histories, features)
+                shown = self.critic.see(histories, features, self.memory)
                 values = self.critic.value(shown).cpu().numpy()
             considered: list[np.ndarray | None] = [None] * len(ticks)
             for i in range(len(ticks)):
@@ -84,7 +97,7 @@ class ActingPolicy:
             )
         return [
             ActionChunk(
-                tick=tick, actions=chunk, policy_version=self.version, value=float(value), candidates=candidates
+                tick=tick, actions=chunk, policy_version=engine.version, value=float(value), candidates=candidates
             )
             for tick, chunk, value, candidates in zip(ticks, chunks, values, considered, strict=True)
         ]
@@ -94,37 +107,8 @@ class ActingPolicy:
     ) -> tuple[np.ndarray, np.ndarray]:
         """The chunk that acts instead, and all that were considered."""
         start = torch.from_numpy(more_noise(noise, steering.samples)).to(self.device)
-        condition = self._denoiser.condition(features[None]).expand(len(start), -1)
-        chunks = ddim_sample(
-            self._denoiser.run, condition, start, self.network.config.ddim_steps,
-            push=lambda clean: steering.push(features, clean),
-        )  # fmt: skip
+        chunks = self._taken.engine.sample(
+            features.expand(len(start), -1), start, push=lambda clean: steering.push(features, clean)
+        )
         chosen = chunks[steering.pick(features, shown, chunks)]
         return chosen.cpu().numpy(), chunks.cpu().numpy()
-
-    def features(self, histories: Sequence[History]) -> Float[Tensor, "B F"]:
-        """Features of each history, every shared frame encoded once."""
-        network = self.network
-        if network.encoder.per_frame:
-            return network.encode(histories)
-        self._encode_new([o for h in histories for o in h])
-        frames = [
-            [torch.cat([self._kept[id(h[t])][1][c] for h in histories]) for c in range(len(network.config.cameras))]
-            for t in range(network.config.n_obs)
-        ]
-        return network.encoder.join(frames, network.normalizer(network.states(histories)))
-
-    def _encode_new(self, observations: Sequence[Observation]) -> None:
-        unseen = list({id(o): o for o in observations if id(o) not in self._kept}.values())
-        size = max(1, len(unseen)) if self.batch is None else 1
-        for new in (unseen[i : i + size] for i in range(0, len(unseen), size)):
-            per_camera = [
-                self.network.encoder.camera_features(
-                    c, 0, torch.from_numpy(np.stack([o.images[c] for o in new])).to(self.device)
-                )
-                for c in self.network.config.cameras
-            ]
-            for i, observation in enumerate(new):
-                self._kept[id(observation)] = (observation, [f[i : i + 1] for f in per_camera])
-        while len(self._kept) > max(KEPT_FRAMES, 2 * len(observations)):
-            self._kept.popitem(last=False)

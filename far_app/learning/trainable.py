@@ -59,6 +59,15 @@ class PlainDenoiser:
         return None
 
 
+class Arrange(Protocol):
+    def __call__(self, module: nn.Module, horizon: int, train: bool = True) -> Trainable: ...
+
+
+def plain(module: nn.Module, horizon: int, train: bool = True) -> Trainable:
+    """The module as it is written: what `trainable` is measured against and tested against."""
+    return PlainDenoiser(module)
+
+
 def trainable(module: nn.Module, horizon: int, train: bool = True) -> Trainable:
     """The quickest way to run this denoiser on its device; gradients only with `train`."""
     fast = arrangeable(module, horizon)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,13 +15,14 @@ from far_app.config import AttributionConfig
 from far_app.learning.attribution import corrected, flag, value_change, without_person
 from far_app.learning.cancellation import Cancelled, check
 from far_app.learning.critic import Critic
+from far_app.learning.memory import FeatureMemory
 from far_app.learning.pairs import Pairs, distance
 from far_app.learning.policy import DiffusionPolicy
 from far_app.protocols import History
 from far_app.types import Adaptation, Attempt, Contrast
 
-HISTORIES_A_PASS = 4
-"""Histories encoded between two looks at `cancelled`: a few ms for a light encoder, some 100 ms for ResNets."""
+HISTORIES_A_PASS = 1
+"""Histories encoded between two looks at `cancelled`: some 70 ms of one core for the paper's ResNets."""
 
 
 def history(attempt: Attempt, tick: int, n_obs: int) -> History:
@@ -30,26 +31,40 @@ def history(attempt: Attempt, tick: int, n_obs: int) -> History:
     return tuple(seen[max(0, tick - back)] for back in reversed(range(n_obs)))
 
 
-def seen(
-    policy: DiffusionPolicy, critic: Critic, attempt: Attempt, ticks: Sequence[int], cancelled: Cancelled
-) -> tuple[Float[Tensor, "S F"], Float[Tensor, "S F"]]:
-    """Of s_t for these ticks: the policy's features, and what the critic takes."""
-    own = features(policy, attempt, ticks, cancelled)
-    if critic.eyes is None:
-        return own, own
-    return own, features(critic.eyes, attempt, ticks, cancelled)
+@dataclass(frozen=True, kw_only=True)
+class Eyes:
+    """Who looks at an attempt, and what they have seen of it already."""
 
+    policy: DiffusionPolicy
+    critic: Critic
+    memory: FeatureMemory
 
-def features(
-    policy: DiffusionPolicy, attempt: Attempt, ticks: Sequence[int], cancelled: Cancelled
-) -> Float[Tensor, "S F"]:
-    """Encoder features of s_t for these ticks."""
-    parts = [torch.zeros(0, policy.feature_dim, device=next(policy.parameters()).device)]
-    for first in range(0, len(ticks), HISTORIES_A_PASS):
+    def own(self, attempt: Attempt, ticks: Sequence[int], cancelled: Cancelled) -> Float[Tensor, "S F"]:
+        """The policy's features of s_t for these ticks."""
+        return self._look(self.policy, "policy", attempt, ticks, cancelled)
+
+    def critics(self, attempt: Attempt, ticks: Sequence[int], cancelled: Cancelled) -> Float[Tensor, "S F"]:
+        """What the critic takes of s_t for these ticks."""
+        if self.critic.eyes is None:
+            return self.own(attempt, ticks, cancelled)
+        return self._look(self.critic.eyes, "critic", attempt, ticks, cancelled)
+
+    def _look(
+        self, network: DiffusionPolicy, eyes: str, attempt: Attempt, ticks: Sequence[int], cancelled: Cancelled
+    ) -> Float[Tensor, "S F"]:
+        """Those not seen before a few at a time."""
+
+        def encode(histories: Sequence[History]) -> Float[Tensor, "S F"]:
+            parts = []
+            for first in range(0, len(histories), HISTORIES_A_PASS):
+                check(cancelled)
+                parts.append(network.encode(histories[first : first + HISTORIES_A_PASS]))
+            return torch.cat(parts)
+
         check(cancelled)
-        some = ticks[first : first + HISTORIES_A_PASS]
-        parts.append(policy.encode([history(attempt, t, policy.config.n_obs) for t in some]))
-    return torch.cat(parts)
+        if not len(ticks):
+            return torch.zeros(0, network.feature_dim, device=next(network.parameters()).device)
+        return self.memory.of([history(attempt, t, network.config.n_obs) for t in ticks], encode, eyes)
 
 
 def recorded_values(attempt: Attempt) -> Float[np.ndarray, "T+1"]:
@@ -57,13 +72,12 @@ def recorded_values(attempt: Attempt) -> Float[np.ndarray, "T+1"]:
     return np.array([*(s.value for s in attempt.steps), np.nan])
 
 
-def values(policy: DiffusionPolicy, critic: Critic, attempt: Attempt, cancelled: Cancelled) -> Float[np.ndarray, "T+1"]:
+def values(eyes: Eyes, attempt: Attempt, cancelled: Cancelled) -> Float[np.ndarray, "T+1"]:
     """V(s_0) … V(s_T): recorded where there is a record, computed now where there is none."""
     found = recorded_values(attempt)
     missing = np.flatnonzero(~np.isfinite(found))
     with torch.no_grad():
-        shown = features(critic.eyes or policy, attempt, missing.tolist(), cancelled)
-        found[missing] = critic.value(shown).cpu().numpy()
+        found[missing] = eyes.critic.value(eyes.critics(attempt, missing.tolist(), cancelled)).cpu().numpy()
     return found
 
 
@@ -77,14 +91,14 @@ def unlearnt(attempt: Attempt, version: str, horizon: int) -> Adaptation:
 
 
 def attributed(
-    adaptation: Adaptation, attempt: Attempt, policy: DiffusionPolicy, critic: Critic, config: AttributionConfig,
-    cancelled: Cancelled,
-) -> Adaptation:  # fmt: skip
+    adaptation: Adaptation, attempt: Attempt, eyes: Eyes, config: AttributionConfig, cancelled: Cancelled
+) -> Adaptation:
     """The adaptation with every V, every ΔV, and the chunks to blame."""
-    found = values(policy, critic, attempt, cancelled)
-    changes = value_change(found, policy.config.horizon)
+    found = values(eyes, attempt, cancelled)
+    horizon = eyes.policy.config.horizon
+    changes = value_change(found, horizon)
     person = np.array([step.intervention for step in attempt.steps], bool)
-    flags = flag(without_person(changes, person, policy.config.horizon), config)
+    flags = flag(without_person(changes, person, horizon), config)
     return replace(
         adaptation, values=found, value_changes=changes, threshold=flags.threshold, corrections=attempt.corrections,
         flagged=corrected(flags.ticks, attempt.corrections, len(changes)),

@@ -38,6 +38,7 @@ class ResamplingMethod:
         self.name = name
         self.network, self.critic, self.config = ingredients.network, ingredients.critic, ingredients.config
         self._act, self._remedy = ingredients.act, remedy(ingredients)
+        self._eyes = evidence.Eyes(policy=self.network, critic=self.critic, memory=ingredients.memory)
         self._swap = threading.Lock()
         self._base = self._act(self.network, BASE_VERSION)
         self.begin(0)
@@ -53,9 +54,7 @@ class ResamplingMethod:
         outdated: Cancelled = lambda: cancelled() or self._trial is not trial  # noqa: E731
         adaptation = evidence.unlearnt(attempt, self.policy.version, self._base.spec.horizon)
         try:
-            adaptation = evidence.attributed(
-                adaptation, attempt, self.network, self.critic, self.config.attribution, outdated
-            )
+            adaptation = evidence.attributed(adaptation, attempt, self._eyes, self.config.attribution, outdated)
             progress(adaptation)
             self._remember(attempt, adaptation.flagged, outdated)
         except AdaptationCancelledError:
@@ -73,7 +72,7 @@ class ResamplingMethod:
 
     def _remember(self, attempt: Attempt, ticks: Sequence[int], outdated: Cancelled) -> None:
         """Add the flagged chunks to the memory and act by it, unless a new trial began or nobody waits any more."""
-        features = evidence.features(self.network, attempt, ticks, outdated)
+        features = self._eyes.own(attempt, ticks, outdated)
         sent = torch.from_numpy(evidence.sent_chunks(attempt, ticks, self._base.spec.horizon))
         with self._swap:
             check(outdated)

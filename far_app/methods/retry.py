@@ -23,11 +23,12 @@ from far_app.learning import diffusion, fcpa
 from far_app.learning.adapted import denoiser_of
 from far_app.learning.cancellation import AdaptationCancelledError, Cancelled, check
 from far_app.learning.critic import Critic
+from far_app.learning.memory import FeatureMemory
 from far_app.learning.pairs import Pairs, candidates, explored, merged, select, weighted_trajectory
 from far_app.learning.policy import DiffusionPolicy, fingerprint
 from far_app.learning.preference import Demonstrations, Noising
 from far_app.learning.steering import Steering
-from far_app.learning.trainable import trainable
+from far_app.learning.trainable import Arrange, trainable
 from far_app.methods import evidence
 from far_app.methods.evidence import sent_chunks
 from far_app.perturbation import Perturbation, perturbation
@@ -56,6 +57,10 @@ class Ingredients:
     config: RetryConfig = field(default_factory=RetryConfig)
     demonstrations: Demonstrations | None = None
     """The bc guard and the failure memory's radius need them."""
+    memory: FeatureMemory = field(default_factory=FeatureMemory)
+    """What the acting policies have seen; shared with them, so that nothing is encoded twice."""
+    arrange: Arrange = trainable
+    """How the denoiser is run for candidates and the update; `plain` to compare with."""
 
 
 class RetryMethod:
@@ -69,6 +74,8 @@ class RetryMethod:
         self.base = self._first
         """With which trials begin."""
         self.critic = ingredients.critic
+        self.memory = ingredients.memory
+        self.arrange = ingredients.arrange
         self.config = ingredients.config
         self.demonstrations = ingredients.demonstrations
         self.perturbation = self.config.perturbation
@@ -114,7 +121,7 @@ class RetryMethod:
             denoiser, pairs = learning.run(progress)
             if denoiser is not None:
                 self._become(denoiser, pairs, outdated)
-                learning.note(version=self.policy.version)
+                learning.note("engine", version=self.policy.version)
         except AdaptationCancelledError:
             learning.note(status="cancelled")
         except FarError as error:
@@ -194,23 +201,24 @@ class _Learning:
             self._last = now
         self.adaptation = replace(self.adaptation, seconds=seconds, **changes)
 
-    def attribute(self, progress: Progress) -> Critic:
-        """Find the chunks to blame; returns the critic that did."""
-        critic = self.method.critic
-        assert critic is not None, "checked when the method was made"
+    def attribute(self, progress: Progress) -> evidence.Eyes:
+        """Find the chunks to blame; returns the eyes that did."""
+        method = self.method
+        assert method.critic is not None, "checked when the method was made"
+        eyes = evidence.Eyes(policy=method.base, critic=method.critic, memory=method.memory)
         self.adaptation = evidence.attributed(
-            self.adaptation, self.attempt, self.method.base, critic, self.method.config.attribution, self.cancelled
+            self.adaptation, self.attempt, eyes, method.config.attribution, self.cancelled
         )
         self.note("attribution")
         progress(self.adaptation)
-        return critic
+        return eyes
 
     def run(self, progress: Progress) -> tuple[nn.Module | None, Pairs]:
         """The adapted denoiser (None when nothing changed) and the pairs it learnt from."""
         method, config = self.method, self.method.config
-        critic = self.attribute(progress)
+        eyes = self.attribute(progress)
         awr = config.fcpa.objective == "awr"
-        pairs = self._trajectory(critic) if awr else self._pairs(critic, self.adaptation.flagged)
+        pairs = self._trajectory(eyes) if awr else self._pairs(eyes, self.adaptation.flagged)
         self.note("pairs", pairs=len(pairs), empty_states=pairs.empty_states)
         progress(self.adaptation)
         if not len(pairs):
@@ -223,22 +231,24 @@ class _Learning:
             denoiser, Noising(add_noise=diffusion.add_noise, steps=diffusion.TRAIN_STEPS),
             pairs if accumulate else merged([*method.rounds, pairs]), config.fcpa, self._rng("fcpa"), self.cancelled,
             lambda step: (self.history.append(step), progress(step))[1], method.demonstrations,
+            method.arrange,
         )  # fmt: skip
         denoiser.requires_grad_(False)
         self.note("update", status=update.status, history=update.history, note=update.note)
         return (denoiser if update.changed else None), pairs
 
-    def _pairs(self, critic: Critic, ticks: tuple[int, ...]) -> Pairs:
+    def _pairs(self, eyes: evidence.Eyes, ticks: tuple[int, ...]) -> Pairs:
         """Candidates under the policy that acted, filtered and ranked, for every flagged chunk."""
-        method, config = self.method, self.method.config.pairs
+        method, config, critic = self.method, self.method.config.pairs, eyes.critic
         spec = method.policy.spec
-        seen, shown = evidence.seen(method.base, critic, self.attempt, ticks, self.cancelled)
+        seen = eyes.own(self.attempt, ticks, self.cancelled)
+        shown = eyes.critics(self.attempt, ticks, self.cancelled)
         negatives = torch.from_numpy(sent_chunks(self.attempt, ticks, spec.horizon)).to(seen.device)
         shape = (config.candidates, spec.horizon, spec.action_dim)
         noise = [self._rng("candidates", t).standard_normal(shape, dtype=np.float32) for t in ticks]
         self.note("encoding")
 
-        runner = trainable(method.acting.denoiser, spec.horizon, train=False)
+        runner = method.arrange(method.acting.denoiser, spec.horizon, train=False)
 
         def denoiser(noisy: Tensor, k: Tensor, condition: Tensor) -> Tensor:
             check(self.cancelled)
@@ -259,14 +269,16 @@ class _Learning:
             self.note(contrasts=evidence.contrasts(pairs, ticks, shown, critic, config.arm_only))
             return pairs
 
-    def _trajectory(self, critic: Critic) -> Pairs:
+    def _trajectory(self, eyes: evidence.Eyes) -> Pairs:
         """Every whole chunk of the attempt, weighted by its advantage (the awr objective)."""
         horizon = self.method.policy.spec.horizon
         ticks = range(len(self.attempt.steps) - horizon + 1)
-        seen, shown = evidence.seen(self.method.base, critic, self.attempt, ticks, self.cancelled)
+        seen = eyes.own(self.attempt, ticks, self.cancelled)
+        shown = eyes.critics(self.attempt, ticks, self.cancelled)
         chunks = torch.from_numpy(sent_chunks(self.attempt, ticks, horizon)).to(seen.device)
         with torch.no_grad():
-            return weighted_trajectory(seen, chunks, critic.q(shown, chunks) - critic.value(shown))
+            advantages = eyes.critic.q(shown, chunks) - eyes.critic.value(shown)
+            return weighted_trajectory(seen, chunks, advantages)
 
     def _rng(self, purpose: str, *key: int) -> np.random.Generator:
         return generator(purpose, self.attempt.scene_seed, self.attempt.index, *key)

@@ -16,6 +16,7 @@ from far_app.config import RetryConfig
 from far_app.errors import FarError
 from far_app.learning.cancellation import AdaptationCancelledError, Cancelled
 from far_app.learning.critic import Critic
+from far_app.learning.memory import FeatureMemory
 from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.preference import Demonstrations
 from far_app.methods import evidence
@@ -67,10 +68,11 @@ def answer(
         if question.critic != RECORDED:
             attempt = replace(attempt, steps=tuple(replace(s, value=float("nan")) for s in attempt.steps))
         say(stage="computing V", note=_caveat(recording))
-        values = evidence.values(networks.policy, networks.critic, attempt, cancelled)
+        eyes = evidence.Eyes(policy=networks.policy, critic=networks.critic, memory=FeatureMemory())
+        values = evidence.values(eyes, attempt, cancelled)
         say(values=values, stage="drawing better chunks" if question.ticks else "")
         if question.ticks:
-            _learn(question, attempt, networks, cancelled, say)
+            _learn(question, attempt, networks, eyes, cancelled, say)
         say(stage="")
     except AdaptationCancelledError:
         return
@@ -81,8 +83,9 @@ def answer(
 
 
 def _learn(
-    question: Question, attempt: Attempt, networks: Networks, cancelled: Cancelled, say: Callable[..., None]
-) -> None:
+    question: Question, attempt: Attempt, networks: Networks, eyes: evidence.Eyes, cancelled: Cancelled,
+    say: Callable[..., None],
+) -> None:  # fmt: skip
     """The lesson of the named chunks: positives, and with `adapt` the gradient steps and what they moved."""
     spec = networks.policy.spec()
     config, steps = networks.retry, networks.retry.fcpa.steps
@@ -92,7 +95,7 @@ def _learn(
     method = RetryMethod(
         "fcpa",
         Ingredients(
-            network=networks.policy, critic=networks.critic, demonstrations=networks.demonstrations,
+            network=networks.policy, critic=networks.critic, demonstrations=networks.demonstrations, memory=eyes.memory,
             config=replace(config, fcpa=fcpa), act=lambda network, version, steering=None: _Actor(spec, version),  # type: ignore[arg-type, return-value]
         ),
         adapts=True, perturbs=False,
@@ -117,17 +120,17 @@ def _learn(
     say(contrasts=adaptation.contrasts)
     if question.adapt:
         say(stage="sampling before and after", **({"note": adaptation.note} if adaptation.note else {}))
-        say(moved=_moved(adaptation.flagged, attempt, networks.policy, method.acting, cancelled))
+        say(moved=_moved(adaptation.flagged, attempt, eyes, method.acting, cancelled))
 
 
 def _moved(
-    ticks: tuple[int, ...], attempt: Attempt, before: DiffusionPolicy, after: DiffusionPolicy, cancelled: Cancelled
+    ticks: tuple[int, ...], attempt: Attempt, eyes: evidence.Eyes, after: DiffusionPolicy, cancelled: Cancelled
 ) -> tuple[Moved, ...]:
     """The same noise through both policies at each flagged state."""
-    found = []
+    found, before = [], eyes.policy
     shape = (SAMPLES, before.config.horizon, before.spec().action_dim)
     for tick in ticks:
-        features = evidence.features(before, attempt, [tick], cancelled).expand(SAMPLES, -1)
+        features = eyes.own(attempt, [tick], cancelled).expand(SAMPLES, -1)
         rng = generator("candidates", attempt.scene_seed, attempt.index, tick)
         noise = torch.from_numpy(rng.standard_normal(shape, dtype=np.float32)).to(features.device)
         old, new = (policy.sample(features, noise).cpu().numpy() for policy in (before, after))

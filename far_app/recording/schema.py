@@ -12,7 +12,7 @@ from functools import lru_cache
 from typing import Any
 
 from far_app.recording.codec import Json, codec
-from far_app.types import ActionChunk, Adaptation, AdaptationStep, Observation, Outcome, Step
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, Observation, Outcome, Step, TickTimes
 
 SCHEMA_NAME = "far-recording"
 SCHEMA_VERSION = 2
@@ -153,6 +153,13 @@ TOPICS = (
     ),
     Topic(name="/chunk", record=ActionChunk, schema_name="far.ActionChunk", what="Every chunk that became ready."),
     Topic(
+        name="/tick_times",
+        record=TickTimes,
+        schema_name="far.TickTimes",
+        what="Every tick of the real-time loop, a few ticks late: the seconds it spent on each stage. Older recordings "
+        "and those made in lockstep have none.",
+    ),
+    Topic(
         name="/camera/<name>",
         record=CompressedImage,
         schema_name="foxglove.CompressedImage",
@@ -190,7 +197,10 @@ CAMERA_TOPIC = "/camera/"
 
 LINES = {
     "session_started": "the writer is ready",
-    "trial_started": "`detail.scene_seed`",
+    "trial_started": "`detail.scene_seed`; in a plan also `detail.method`, `detail.label` (what the operator was told),"
+    " `detail.scene`, `detail.repetition`, `detail.max_attempts`, `detail.policy`",
+    "scene_matched": "a plan's real scene was ready: `detail.scene`, `detail.scores` by camera (none: the scene's "
+    "first start, which later ones are held against), `detail.limit`, `detail.pictures` by camera",
     "attempt_started": "`detail.file`, `detail.scene_seed`, `detail.policy_version`, `detail.previous`",
     "attempt_ended": "`detail.success`, `detail.judged_by`, `detail.note`, `detail.steps`; its steps are on the disk",
     "attempt_abandoned": "the attempt ended without an outcome; `text` says why, `detail.steps`",

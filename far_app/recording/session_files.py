@@ -15,6 +15,7 @@ from typing import Any
 from far_app.errors import RecordingError
 from far_app.recording.append_file import sync_file, sync_folder
 from far_app.recording.attempt_file import AttemptFile
+from far_app.recording.scene_file import SceneAccepted, write_scene
 from far_app.recording.schema import AttemptHeader, RecordedEvent, SessionInfo
 from far_app.recording.session_folder import (
     TrialsLog,
@@ -24,7 +25,7 @@ from far_app.recording.session_folder import (
     trial_folder,
 )
 from far_app.recording.weights_file import weights_path, write_weights
-from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step, TickTimes
 
 _SPACE_CHECK_INTERVAL = 5.0
 _LATE = 1.0
@@ -56,9 +57,14 @@ class SessionFiles:
         except OSError as error:
             raise RecordingError(f"cannot record to {self.folder}: {error.strerror}; choose another folder") from error
 
-    def begin_trial(self, stamp: float, trial: int, scene_seed: int) -> None:
+    def begin_trial(self, stamp: float, trial: int, scene_seed: int, detail: Mapping[str, Any]) -> None:
         (self.folder / trial_folder(trial)).mkdir()
-        self._trials.append("trial_started", stamp=stamp, trial=trial, detail={"scene_seed": scene_seed})
+        self._trials.append("trial_started", stamp=stamp, trial=trial, detail={"scene_seed": scene_seed, **detail})
+
+    def scene(self, stamp: float, trial: int, accepted: SceneAccepted) -> None:
+        detail = write_scene(self.folder, trial, accepted)
+        self._unsynced.extend(self.folder / name for name in detail["pictures"].values())
+        self._trials.append("scene_matched", stamp=stamp, trial=trial, detail=detail)
 
     def begin_attempt(self, stamp: float, header: AttemptHeader) -> None:
         self.close_attempt()
@@ -77,6 +83,9 @@ class SessionFiles:
 
     def chunk(self, stamp: float, chunk: ActionChunk) -> None:
         self._open.chunk(chunk, stamp)
+
+    def tick_times(self, stamp: float, times: TickTimes) -> None:
+        self._open.tick_times(times)
 
     def end_attempt(self, stamp: float, attempt: Attempt) -> None:
         file, outcome = self._open, attempt.outcome

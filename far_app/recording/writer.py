@@ -23,10 +23,11 @@ from pathlib import Path
 from typing import Any
 
 from far_app.errors import RecordingError
+from far_app.recording.scene_file import SceneAccepted
 from far_app.recording.schema import SCHEMA_VERSION, AttemptHeader, SessionInfo, json_schemas
 from far_app.recording.session_files import SessionFiles
 from far_app.recording.session_folder import SPACE_TO_GO_ON, SPACE_TO_START, attempt_name
-from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step, TickTimes
 
 log = logging.getLogger(__name__)
 
@@ -81,6 +82,7 @@ class SessionWriter:
         self._closed = False
         self._trial = 0
         self._scene_seed = 0
+        self._method = info.method
         self._attempt = 0
         self._previous = ""
         self._last_tick: int | None = None
@@ -89,10 +91,15 @@ class SessionWriter:
         self._thread.start()
         log.info("recording to %s", self.folder)
 
-    def begin_trial(self, trial: int, scene_seed: int) -> None:
-        """`trial` counts from 1."""
+    def begin_trial(self, trial: int, scene_seed: int, detail: Mapping[str, Any] | None = None) -> None:
+        """`trial` counts from 1; `detail` is what a plan says of it (its `method` comes before the session's)."""
         self._trial, self._scene_seed, self._attempt, self._previous = trial, scene_seed, 0, ""
-        self._put(self._files.begin_trial, trial, scene_seed)
+        self._method = str((detail or {}).get("method") or self.header.info.method)
+        self._put(self._files.begin_trial, trial, scene_seed, dict(detail or {}))
+
+    def add_scene(self, accepted: SceneAccepted) -> None:
+        """How the real scene of the trial that has just begun looks; its arrays are not copied and must not change."""
+        self._put(self._files.scene, self._trial, accepted)
 
     def begin_attempt(self, index: int, policy_version: str) -> None:
         """A new file, linked to the attempt before it, whose file is closed now."""
@@ -100,7 +107,7 @@ class SessionWriter:
         assert self._last_tick is None, f"attempt {self._attempt} of trial {self._trial} is still under way"
         header = AttemptHeader(
             schema_version=SCHEMA_VERSION, session=self.header.session, task=self.header.info.task,
-            method=self.header.info.method, trial=self._trial, attempt=index, scene_seed=self._scene_seed,
+            method=self._method, trial=self._trial, attempt=index, scene_seed=self._scene_seed,
             policy_version=policy_version, previous=self._previous,
             wall_minus_monotonic=self.header.wall_minus_monotonic,
         )  # fmt: skip
@@ -114,6 +121,11 @@ class SessionWriter:
         if step.tick > self._last_tick:
             self._last_tick = step.tick
             self._put(self._files.step, step)
+
+    def add_tick_times(self, times: TickTimes) -> None:
+        """Where a tick of the running attempt spent its time, once that is known."""
+        assert self._attempt > 0, "a tick's times need an attempt: call begin_attempt first"
+        self._put(self._files.tick_times, times)
 
     def add_chunk(self, chunk: ActionChunk) -> None:
         """A chunk, as it became ready. Late ones are taken until the attempt's file is closed."""

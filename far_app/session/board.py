@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
 from far_app.config import TaskConfig
 from far_app.lineage import Versions
 from far_app.motion import ActionScale
+from far_app.protocols import EngineReport
 from far_app.session.history import History
 from far_app.session_states import Intent, State
 from far_app.take_over import Steering
-from far_app.telemetry import LogLine, Telemetry, TrialRow
+from far_app.telemetry import HIDDEN, LogLine, Telemetry, TrialRow
+from far_app.trial_plan.shown import PlanShown, SceneShown
 from far_app.types import ActionChunk, Adaptation, AdaptationStep, Observation, Step, Trial
 
 
@@ -46,11 +49,26 @@ class Board:
         self.adapting = False
         self.trial = self.attempt = self.scene_seed = 0
         self.policy_version = ""
+        self.plan: PlanShown | None = None
+        self.scene: SceneShown | None = None
+        """A real scene of a plan that is being rebuilt."""
+        self.blind = False
+        """Nothing that gives the method away is shown."""
+        self._max_attempts = task.max_attempts
+        self.engine = EngineReport(name="")
+        """What runs the policy of the attempt."""
 
     def log(self, text: str, level: str = "info") -> None:
         self._log.append(LogLine(stamp=time.monotonic(), level=level, text=text))
 
-    def trial_started(self, trial: int, scene_seed: int) -> None:
+    def trial_awaited(self, method: str, *, blind: bool) -> None:
+        """What is told of the trial that comes."""
+        self._method, self.blind = method, blind
+        self.attempt, self.policy_version = 0, ""
+        self._clear()
+
+    def trial_started(self, trial: int, scene_seed: int, max_attempts: int) -> None:
+        self._max_attempts = max_attempts
         self.trial, self.scene_seed, self.attempt = trial, scene_seed, 1
         self._began = time.monotonic()
         self._latest, self.adaptation_steps = None, ()
@@ -98,10 +116,11 @@ class Board:
         status = latest.status if latest else ""
         if self.adapting and status in ("", "none"):
             status = "update" if self.adaptation_steps else "attribution" if latest is None else "candidates"
-        return Telemetry(
+        whole = Telemetry(
             seq=0, stamp=0.0, state=state, reason=self.reason, countdown=self.countdown, session=self._session,
-            task=self._task.name, method=self._method, policy_version=self.policy_version, trial=self.trial,
-            trials=self._trials, attempt=self.attempt, max_attempts=self._task.max_attempts, scene_seed=self.scene_seed,
+            task=self._task.name, method=self._method, policy_version=self.policy_version, engine=self.engine.name,
+            engine_refused=self.engine.refused, trial=self.trial, trials=self._trials, attempt=self.attempt,
+            max_attempts=self._max_attempts, scene_seed=self.scene_seed,
             tick=len(self._values), horizon=self._task.horizon, rate=self._task.rate, chunk_horizon=self._chunk_horizon,
             values=np.array(values, dtype=float),
             value_changes=curve.value_changes if curve else np.zeros(0),
@@ -114,8 +133,9 @@ class Board:
             action=step.commanded if step is not None else np.zeros(0), chunk_path=self._path(newest),
             history=self.history.trials,
             attempts=self.history.attempts, log=tuple(self._log), refusal=self.refusal, allowed=allowed,
-            steering=self.steering, versions=self.versions,
+            steering=self.steering, versions=self.versions, plan=self.plan, scene=self.scene,
         )  # fmt: skip
+        return blinded(whole) if self.blind else whole
 
     def _path(self, newest: Observation | None) -> np.ndarray:
         """Positions the newest chunk leads through from here, metres (H, 3)."""
@@ -127,3 +147,14 @@ class Board:
         self._values = []
         self._step = self._chunk = self._curve = None
         self.adapting = False
+
+
+def blinded(telemetry: Telemetry) -> Telemetry:
+    """Without what tells which method acts: what it learnt, from what, and which version of the policy it left."""
+    history = tuple(replace(row, flagged=0) for row in telemetry.history)
+    attempts = tuple(replace(attempt, policy_version="") for attempt in telemetry.attempts)
+    return replace(
+        telemetry, policy_version="", value_changes=np.zeros(0), threshold=float("nan"), flagged=(), adaptation=(),
+        adaptation_status=HIDDEN if telemetry.adaptation_status else "", pairs=0, history=history,
+        attempts=attempts, versions=Versions(unavailable=telemetry.versions.unavailable),
+    )  # fmt: skip

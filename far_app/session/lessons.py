@@ -81,8 +81,12 @@ class Lessons:
         if weights is not None and new:
             self.standing.recorder.add_weights(weights, adaptation)
         self.versions.adapted(adaptation, weights if new else None)
+        if self.standing.board.blind:
+            return self.standing.say("the arm is home and what follows the failure is done")
         note = f" ({adaptation.note})" if adaptation.note else ""
-        self.standing.say(f"adaptation: {adaptation.status}, {adaptation.pairs} pairs → {adaptation.version}{note}")
+        return self.standing.say(
+            f"adaptation: {adaptation.status}, {adaptation.pairs} pairs → {adaptation.version}{note}"
+        )
 
     def end(self) -> None:
         """Cancel what still runs; returns once it has ended."""

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from far_app.errors import RecordingError
+from far_app.recording.scene_file import SceneAccepted
 from far_app.recording.writer import SessionWriter
-from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step, TickTimes
 
 
 class Recorder:
@@ -29,8 +30,11 @@ class Recorder:
         """The session's folder; None without a writer."""
         return self._writer.folder if self._writer is not None else None
 
-    def begin_trial(self, trial: int, scene_seed: int) -> None:
-        self._hand(lambda w: w.begin_trial(trial, scene_seed))
+    def begin_trial(self, trial: int, scene_seed: int, detail: Mapping[str, Any] | None = None) -> None:
+        self._hand(lambda w: w.begin_trial(trial, scene_seed, detail))
+
+    def scene(self, accepted: SceneAccepted) -> None:
+        self._hand(lambda w: w.add_scene(accepted))
 
     def begin_attempt(self, index: int, policy_version: str) -> None:
         self._hand(lambda w: w.begin_attempt(index, policy_version))
@@ -40,6 +44,9 @@ class Recorder:
 
     def add_step(self, step: Step) -> None:
         self._hand(lambda w: w.add_step(step))
+
+    def add_tick_times(self, times: TickTimes) -> None:
+        self._hand(lambda w: w.add_tick_times(times))
 
     def end_attempt(self, attempt: Attempt) -> None:
         self._hand(lambda w: w.end_attempt(attempt))

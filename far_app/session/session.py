@@ -18,10 +18,11 @@ from far_app.detectors import OperatorOverride
 from far_app.errors import RobotError
 from far_app.guided import guided_trial
 from far_app.motion import ActionScale
-from far_app.protocols import Hold, Method, PlanRequest, Robot, SuccessDetector
+from far_app.protocols import EngineReport, Hold, Method, PlanRequest, Robot, RunsOnEngine, SuccessDetector
 from far_app.scheduling import LOOP_PRIORITY, real_time_inside
 from far_app.session.board import Board
 from far_app.session.clock import TickClock
+from far_app.session.course import Assignment, Consecutive, Course, Demonstrations
 from far_app.session.inbox import IntentInbox
 from far_app.session.lessons import Lessons
 from far_app.session.marking import Marking
@@ -36,6 +37,7 @@ from far_app.session.standing import IN_ATTEMPT, Standing
 from far_app.session.statistics import LoopStatistics
 from far_app.session.steering import Helper
 from far_app.session.supervision import Supervision, TrialAbandoned
+from far_app.session.timeline import AGGREGATE, INFER, OBSERVE, PUBLISH, RECORD
 from far_app.session.versions import VersionKeeper
 from far_app.session.watched import WatchedRobot
 from far_app.session_states import Happening, Intent, State
@@ -72,10 +74,14 @@ class Session:
         statistics: LoopStatistics,
         publisher: TelemetryPublisher | None = None,
         alarm: Alarm = NO_ALARM,
+        course: Course | None = None,
         keep: Keep = drop,
     ) -> None:
-        """`keep` takes a demonstration that the operator keeps."""
+        """`course`: which trial comes next; by default `method` on `settings.trials` scenes from `settings.seed` on.
+        `keep` takes a demonstration that the operator keeps."""
         self.settings, self.task, self.scale, self.alarm = settings, task, scale, alarm
+        usual = Demonstrations if settings.demonstrate else Consecutive
+        self.course: Course = course or usual(method, seed=settings.seed, trials=settings.trials)
         self.planner, self.method, self.recorder, self.statistics = planner, method, recorder, statistics
         self.robot = WatchedRobot(robot, statistics)
         self.detector = OperatorOverride(detector)
@@ -90,7 +96,7 @@ class Session:
         self.standing.withheld[Intent.TAKE_OVER] = settings.no_take_over
         self.helper = Helper(self.standing, inbox, scale)
         marking = Marking(self.standing, settings.name)
-        self.versions = VersionKeeper(self.standing, method, recorder.folder)
+        self.versions = VersionKeeper(self.standing, method, recorder.folder, self.course.fixed)
         self.inbox, self.operator = (
             inbox,
             Operator(inbox, self.standing, self.helper, marking, self.versions, self.clock.period),
@@ -108,7 +114,7 @@ class Session:
         """The newest failed attempt."""
         self._ended = float("nan")
         self._attempts: list[Attempt] = []
-        self._seed = self._tick = self._recorded = 0
+        self._chance = self._tick = self._recorded = 0
         self._in_attempt = False
         self._stretch = 1
 
@@ -116,23 +122,26 @@ class Session:
 
     def run(self) -> list[TrialResult]:
         """All trials, or until the operator quits. Raises SessionFault (headless), RecordingError and RobotError."""
-        number = done = 0
-        scene = self.settings.seed
+        number = 0
         try:
             with real_time_inside(LOOP_PRIORITY) as scheduling, collector_off():
                 log.info("the loop is scheduled %s", scheduling)
                 self.robot.refresh()
                 while self._between_trials():
-                    if self.settings.trials and done == self.settings.trials:
+                    asked = self.course.next()
+                    self.board.plan = self.course.shown()
+                    if asked is None:
                         self.standing.happen(Happening.NO_MORE_TRIALS)
                         break
-                    if self.settings.await_scene and not self.supervision.await_scene():
+                    self.board.trial_awaited(asked.label, blind=asked.blind)
+                    if self.settings.await_scene and not self.supervision.await_scene(asked.gate):
                         break
                     number += 1
-                    self._run_trial(number, scene)
-                    word = self._reviewed(done) if self.settings.demonstrate else Intent.KEEP
-                    done += word is Intent.KEEP
-                    scene += word is not Intent.RECORD_AGAIN
+                    result = self._run_trial(number, asked)
+                    if isinstance(self.course, Demonstrations):
+                        result = replace(result, word=self._reviewed(self.course.kept))
+                    self.course.ended(asked, result)
+                    self.board.plan = self.course.shown()
         finally:
             self._finish()
         return self.results
@@ -155,17 +164,21 @@ class Session:
             pass
         return self.standing.state is not State.FINISHED
 
-    def _run_trial(self, number: int, seed: int) -> None:
+    def _run_trial(self, number: int, asked: Assignment) -> TrialResult:
         """One trial on one scene, whatever becomes of it."""
         self.standing.trial_begins()
-        self._seed, self._attempts = seed, []
+        self.method, self._attempts = asked.method, []
+        self._chance = asked.seed if asked.chance is None else asked.chance
+        task = replace(self.task, max_attempts=asked.max_attempts or self.task.max_attempts)
         self.lessons.trial_begins()
         self.versions.trial_begins()
-        self.board.trial_started(number, seed)
-        self.recorder.begin_trial(number, seed)
-        self.standing.say(f"trial {number}: scene {seed}")
+        self.board.trial_started(number, asked.seed, task.max_attempts)
+        self.recorder.begin_trial(number, asked.seed, asked.record)
+        if asked.gate is not None and self.settings.await_scene and self.robot.newest is not None:
+            self.recorder.scene(asked.gate.accepted(self.robot.newest))
+        self.standing.say(f"trial {number}: scene {asked.seed}")
         self._stretch = self.settings.first_stretch if number == 1 else 1
-        events = self._events(seed)
+        events = self._events(asked.seed, task)
         answer: float | None = None
         try:
             while True:
@@ -177,15 +190,16 @@ class Session:
         finally:
             events.close()
             self.lessons.end()
-            self._account()
+            result = self._account(asked.seed, task.max_attempts)
+        return result
 
-    def _events(self, seed: int) -> TrialEvents:
+    def _events(self, seed: int, task: TaskConfig) -> TrialEvents:
         """What happens on this scene: Algorithm 1, or a person leading the arm by hand."""
         if self.settings.demonstrate == "hand":
-            return guided_trial(seed, self.robot, self.detector, self.task, self.scale, self.helper)
+            return guided_trial(seed, self.robot, self.detector, task, self.scale, self.helper)
         return trial(
-            seed, self.robot, self.planner, self.method, self.detector, self.task, self.scale, self.lessons.start,
-            self._stretch, self.alarm, self.helper,
+            seed, self.robot, self.planner, self.method, self.detector, task, self.scale, self.lessons.start,
+            self._stretch, self.alarm, self.helper, self._chance,
         )  # fmt: skip
 
     def _answer(self, event: Event) -> float | None:
@@ -205,22 +219,31 @@ class Session:
 
     def _pass_tick(self, tick: Tick) -> float:
         """Bookkeeping of the last tick, then wait for this one's deadline and attend to what happened."""
+        timeline = self.statistics.timeline
         self.planner.go()
+        timeline.lap(AGGREGATE)
         if tick.step is not None and tick.step.tick == self._recorded:
             self._record(tick.step)
         self._report()
+        timeline.lap(RECORD)
         if tick.phase == "judging" and not self.board.reason:
             self.board.reason = f"success or failure? Say so within {self.detector.patience:g} s, or it is a failure"
             self.standing.say(self.board.reason)
         self.standing.show()
+        timeline.lap(PUBLISH)
         due = self.clock.wait()
+        timeline.begin(self._tick - tick.between if tick.phase == "attempt" else -1, due)
         held = self.supervision.attend(tick.phase)
         if held and tick.phase == "attempt" and self.standing.state in IN_ATTEMPT:
             if self.settings.demonstrate != "hand":
                 self._prime()
             self.clock.restart()
             due = AfterHold(self.clock.wait())
+            timeline.restart()
             self.supervision.attend(tick.phase)
+        elif held:
+            timeline.restart()
+        timeline.lap(OBSERVE)
         self._tick += not tick.between
         return due
 
@@ -233,6 +256,8 @@ class Session:
         self.helper.attempt_begins()
         version = self.versions.attempt_begins(event.policy_version)
         self.board.attempt_started(event.attempt_index, version)
+        if isinstance(self.method.policy, RunsOnEngine):
+            self._runs_on(self.method.policy.runs_on)
         self.recorder.begin_attempt(event.attempt_index, version)
         if slowly:
             self.standing.say(f"attempt {event.attempt_index} runs at 1/{self._stretch} of the policy's speed")
@@ -247,11 +272,20 @@ class Session:
             self.statistics.homing.append(time.monotonic() - self._ended)
         self.clock.restart()
 
+    def _runs_on(self, engine: EngineReport) -> None:
+        """Show and record what runs the policy; what was refused (and logged where it was) is told once."""
+        known = self.board.engine
+        for refused in engine.refused[len(known.refused) :]:
+            self.board.log(f"engine refused, {refused}; {engine.name} runs the policy", "warning")
+        if engine != known:
+            self.recorder.event("engine", engine.name, {"why": engine.why, "refused": list(engine.refused)})
+        self.board.engine = engine
+
     def _attempt_ended(self, event: AttemptEnded) -> None:
         attempt, standing = event.attempt, self.standing
         for step in attempt.steps[self._recorded :]:
             self._record(step)
-        self._report()
+        self._report(all_times=True)
         self.recorder.end_attempt(attempt)
         self.board.history.attempt_ended(self.board.trial, attempt)
         self.versions.attempt_ended(attempt.outcome.success)
@@ -272,17 +306,17 @@ class Session:
             raise TrialAbandoned
         collect_between()
 
-    def _account(self) -> None:
+    def _account(self, seed: int, max_attempts: int) -> TrialResult:
         """The trial's row and result; an attempt that was cut off has no outcome and is closed as such."""
         standing = self.standing
         if self._in_attempt:
-            self._report()
+            self._report(all_times=True)
             self._in_attempt = False
             self.recorder.abandon_attempt(self.board.reason or "the session was ended")
         if standing.marked is not None and self._attempts:
             self._attempts[-1] = replace(self._attempts[-1], outcome=standing.marked)
             self.recorder.mark(standing.marked)
-        result = Trial(scene_seed=self._seed, attempts=tuple(self._attempts), adaptations=tuple(self.lessons.learnt))
+        result = Trial(scene_seed=seed, attempts=tuple(self._attempts), adaptations=tuple(self.lessons.learnt))
         last = self._attempts[-1].outcome if self._attempts else None
         judged_by = last.judged_by.value if last else ""
         helped = any(step.intervention for attempt in self._attempts for step in attempt.steps)
@@ -291,12 +325,14 @@ class Session:
         note = "; ".join([*remarks, last.note if last else "no attempt was finished"])
         self.board.trial_ended(result, judged_by, note, counted)
         self.recorder.end_trial(result.success, len(result.attempts))
+        tried = len(result.attempts) >= max_attempts and not standing.skipping
         self.results.append(
             TrialResult(
-                seed=self._seed, attempts=len(result.attempts), success=result.success, judged_by=judged_by,
-                counted=counted,
+                seed=seed, attempts=len(result.attempts), success=result.success, judged_by=judged_by,
+                counted=counted, finished=result.success or tried,
             )
         )  # fmt: skip
+        return self.results[-1]
 
     def _finish(self) -> None:
         """Hold the arm, close the recording, show the last state."""
@@ -316,7 +352,7 @@ class Session:
         self.planner.prime(
             PlanRequest(
                 history=(newest,) * policy.spec.n_obs, tick=self._tick, policy=policy,
-                noise_key=(self._seed, self.board.attempt, self._tick),
+                noise_key=(self._chance, self.board.attempt, self._tick),
             )
         )  # fmt: skip
 
@@ -326,8 +362,12 @@ class Session:
         self.board.stepped(step)
         self.recorder.add_step(step)
 
-    def _report(self) -> None:
-        """New chunks, the operator's words on them and what is being learnt go to the page and the recording."""
+    def _report(self, *, all_times: bool = False) -> None:
+        """New chunks, the operator's words on them and what is being learnt go to the page and the recording; so do the
+        attempt's ticks whose times are complete, or all that are left."""
+        self.statistics.timeline.elsewhere(INFER, self.planner.spent())
+        for times in self.statistics.timeline.settled(all_of_them=all_times):
+            self.recorder.add_tick_times(times)
         for chunk in self.planner.handed_out():
             self.board.planned(chunk)
             self.recorder.add_chunk(chunk)

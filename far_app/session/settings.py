@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from far_app.session_states import Intent
+
 
 @dataclass(frozen=True, kw_only=True)
 class Freshness:
@@ -54,3 +56,7 @@ class TrialResult:
     judged_by: str
     counted: bool = True
     """False for a trial that began at reduced speed, or in which a person helped."""
+    word: Intent = Intent.KEEP
+    """The operator's, on a demonstration: keep, discard, or record again."""
+    finished: bool = True
+    """It ended by itself: solved, or out of attempts; not skipped and not cut off."""

@@ -12,6 +12,7 @@ import time
 from far_app.errors import FarError, RobotError
 from far_app.protocols import Heartbeat, Home
 from far_app.session.clock import TickClock
+from far_app.session.course import Gate
 from far_app.session.operator import Operator
 from far_app.session.planners import ThreadedPlanner
 from far_app.session.settings import Freshness
@@ -93,20 +94,28 @@ class Supervision:
         self._fetch()
         self._notice("between")
 
-    def await_scene(self) -> bool:
-        """Hold until the operator has rebuilt the scene and says that the workspace is clear; False when the session
-        ended instead."""
+    def await_scene(self, gate: Gate | None = None) -> bool:
+        """Hold until the operator has rebuilt the scene, which a plan's `gate` looks at, and says that the workspace is
+        clear; False when the session ended instead."""
         self.standing.hold("waiting for the scene")
         while self.standing.state is not State.FINISHED:
             if self.standing.state in (State.READY, State.TRIAL_DONE):
                 self.standing.happen(Happening.NEED_SCENE)
+            seen = self.robot.newest
+            self.board.scene = gate.look(seen) if gate is not None and seen is not None else None
             self.standing.show()
             time.sleep(self.clock.period)
             self._fetch()
             for intent in self.operator.inbox.drain():
                 asked = self.standing.state
+                awaited = intent is Intent.SCENE_READY and asked is State.AWAITING_SCENE
+                if awaited and gate is not None and seen is not None and (why := gate.refusal(seen)):
+                    self.board.refusal = why
+                    self.standing.say(why, "warning")
+                    continue
                 self.operator.ask(intent, "between")
                 if asked is State.AWAITING_SCENE and self.standing.state is State.READY:
+                    self.board.scene = None
                     return True
             self.operator.listen()
             self._notice("between")

@@ -26,10 +26,11 @@ ROWS = 100
 
 
 class VersionKeeper:
-    def __init__(self, standing: Standing, method: Method, folder: Path | None) -> None:
-        """`folder`: the session's recording, where old weights lie."""
-        self.standing, self._folder = standing, folder
-        self._method = method if isinstance(method, ChangesWeights) else None
+    def __init__(self, standing: Standing, method: Method, folder: Path | None, fixed: str = "") -> None:
+        """`folder`: the session's recording, where old weights lie. `fixed`: why the operator chooses no versions
+        here."""
+        self.standing, self._folder, self._fixed = standing, folder, fixed
+        self._method = method if isinstance(method, ChangesWeights) and not fixed else None
         self._rows: dict[str, PolicyRow] = {BASE: PolicyRow(name=BASE, parent="")}
         self._weights: dict[str, AdaptedWeights] = {}
         self._next: VersionWish | None = None
@@ -62,7 +63,7 @@ class VersionKeeper:
         """An adaptation is over; `weights` when it made a version."""
         if adaptation.status == "withdrawn":
             self.acting = self._base
-        if weights is None:
+        if weights is None or self._fixed:
             return
         board = self.standing.board
         name = f"{board.trial}:{weights.version}"
@@ -118,7 +119,7 @@ class VersionKeeper:
         return ""
 
     def unavailable(self) -> str:
-        return "" if self._method is not None else "this method has no weights that change"
+        return self._fixed or ("" if self._method is not None else "this method has no weights that change")
 
     def undo_target(self) -> str:
         """What an undo would lead to; "" when there is nothing to undo in this trial."""

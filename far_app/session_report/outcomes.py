@@ -6,7 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from far_app.recording.reader import SessionRecording
+from far_app.recording.schema import LogEntry
+from far_app.session_states import Intent
 from far_app.statistics import mcnemar, paired_difference, wilson
+
+APART = ("reduced_speed", "taken_over")
+"""Events that leave their trial out of every figure: it was not the method's own doing alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +33,8 @@ class TrialOutcome:
     solved_by: int | None
     """The attempt that succeeded; None when none did."""
     attempts: int
+    repetition: int = 0
+    """A plan's, 1-based; 0 outside of one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,46 +79,62 @@ class Difference:
     """Exact McNemar, two-sided."""
 
 
-def groups(sessions: Sequence[SessionRecording]) -> list[Group]:
-    """By what was compared, in order of appearance."""
+def groups(sessions: Sequence[SessionRecording], names: Mapping[str, str] | None = None) -> list[Group]:
+    """By what was compared, in order of appearance. `names`: what a plan's methods are to be called, where not by their
+    own names."""
     found: dict[Compared, list[TrialOutcome]] = {}
     unfinished: dict[Compared, int] = {}
     limits: dict[Compared, int] = {}
     for session in sessions:
-        info = session.header.info
-        what = Compared(task=info.task, method=info.method, policy=info.policy)
-        ended, left = ended_trials(session)
-        found.setdefault(what, []).extend(ended)
-        unfinished[what] = unfinished.get(what, 0) + left
-        limits[what] = max(limits.get(what, 1), allowed(session) or 1, *(t.attempts for t in ended), 1)
+        ended = {t.trial: t for t in ended_trials(session)}
+        for entry in session.log:
+            if entry.event == "trial_started":
+                what, trial = _compared(session, entry, names or {}), ended.get(entry.trial)
+                found.setdefault(what, []).extend([trial] if trial else [])
+                unfinished[what] = unfinished.get(what, 0) + (trial is None)
+                known = (allowed(session, entry.trial) or 1, trial.attempts if trial else 1)
+                limits[what] = max(limits.get(what, 1), *known)
     return [
         Group(what=what, max_attempts=limits[what], trials=tuple(trials), unfinished=unfinished[what])
         for what, trials in found.items()
     ]
 
 
-def ended_trials(session: SessionRecording) -> tuple[list[TrialOutcome], int]:
-    """Trials that ended by themselves, under the last word on each attempt, and how many did not."""
-    scenes = {e.trial: int(e.detail.get("scene_seed", 0)) for e in session.log if e.event == "trial_started"}
-    apart = {e.trial for e in session.log if e.event in ("reduced_speed", "taken_over")}
-    apart |= {trial for trial, _ in session.unsure}
+def _compared(session: SessionRecording, started: LogEntry, names: Mapping[str, str]) -> Compared:
+    """What a trial counts for: the session's method, or its own in a plan."""
+    info = session.header.info
+    method = str(started.detail.get("method") or info.method)
+    blinded = method in names
+    policy = "" if blinded else str(started.detail.get("policy") or info.policy)
+    return Compared(task=info.task, method=names.get(method, method), policy=policy)
+
+
+def ended_trials(session: SessionRecording) -> list[TrialOutcome]:
+    """Trials that ended by themselves, under the last word on each attempt; not those that were skipped, cut off, begun
+    at reduced speed, helped by a person, marked unsure, or are not yet over."""
+    started = {e.trial: e.detail for e in session.log if e.event == "trial_started"}
+    apart = {e.trial for e in session.log if e.event in APART} | {trial for trial, _ in session.unsure}
+    skipped = {e.trial for e in session.log if e.event == "intent" and e.text == Intent.SKIP_TRIAL}
     over = {e.trial for e in session.log if e.event == "trial_ended"} - apart
-    limit, ended = allowed(session), []
-    for trial in sorted(over & set(scenes)):
+    ended = []
+    for trial in sorted(over & set(started)):
         said = {attempt: o.success for (t, attempt), o in sorted(session.marks.items()) if t == trial}
         solved_by = next((attempt for attempt, success in said.items() if success), None)
-        if solved_by is not None or (said and len(said) >= (limit or 1)):
+        tried = len(said) >= (allowed(session, trial) or 1) and trial not in skipped
+        if solved_by is not None or (said and tried):
             ended.append(TrialOutcome(
-                session=session.header.session, trial=trial, scene=scenes[trial], solved_by=solved_by,
-                attempts=solved_by or len(said),
+                session=session.header.session, trial=trial, scene=int(started[trial].get("scene_seed", 0)),
+                solved_by=solved_by, attempts=solved_by or len(said),
+                repetition=int(started[trial].get("repetition", 0)),
             ))  # fmt: skip
-    return ended, len(scenes) - len(ended)
+    return ended
 
 
-def allowed(session: SessionRecording) -> int | None:
+def allowed(session: SessionRecording, trial: int) -> int | None:
     """Attempts a trial may have; None when the recording does not say."""
+    own = next((e.detail for e in session.log if e.event == "trial_started" and e.trial == trial), {})
     config: Mapping[str, Mapping[str, object]] = session.header.info.config
-    known = config.get("task", {}).get("max_attempts")
+    known = own.get("max_attempts", config.get("task", {}).get("max_attempts"))
     return int(known) if isinstance(known, int) else None
 
 
@@ -137,11 +160,11 @@ def differences(found: Sequence[Group]) -> list[Difference]:
                 attempts = min(left.max_attempts, right.max_attempts)
                 pairs = shared(left, right, attempts)
                 if pairs:
-                    out.append(_difference(names[i], names[j], pairs))
+                    out.append(difference(names[i], names[j], pairs))
     for name, group in zip(names, found, strict=True):
         if group.max_attempts > 1 and group.trials:
             pairs = list(zip(group.solved(group.max_attempts), group.solved(1), strict=True))
-            out.append(_difference(name, f"{name}, first attempt", pairs))
+            out.append(difference(name, f"{name}, first attempt", pairs))
     return out
 
 
@@ -153,14 +176,15 @@ def shared(left: Group, right: Group, attempts: int) -> list[tuple[bool, bool]]:
         out = {}
         for trial, solved in zip(group.trials, group.solved(attempts), strict=True):
             seen[trial.scene] = seen.get(trial.scene, 0) + 1
-            out[trial.scene, seen[trial.scene]] = solved
+            out[trial.scene, trial.repetition or seen[trial.scene]] = solved
         return out
 
     ours, theirs = numbered(left), numbered(right)
     return [(ours[key], theirs[key]) for key in sorted(ours.keys() & theirs.keys())]
 
 
-def _difference(left: str, right: str, pairs: Sequence[tuple[bool, bool]]) -> Difference:
+def difference(left: str, right: str, pairs: Sequence[tuple[bool, bool]]) -> Difference:
+    """Of scenes solved (left, right); at least one pair."""
     mean, low, high = paired_difference([a for a, _ in pairs], [b for _, b in pairs])
     only_left, only_right = sum(a and not b for a, b in pairs), sum(b and not a for a, b in pairs)
     return Difference(

@@ -16,6 +16,8 @@ from far_app.errors import ConfigError, RecordingError
 from far_app.recording.reader import SessionRecording, read_attempt, read_session
 from far_app.session_report.failures import card
 from far_app.session_report.outcomes import Group, by_attempt, differences, groups, labels
+from far_app.session_report.plans import Planned, plans
+from far_app.trial_plan.telling import to_go
 
 STYLE = """
 :root { color-scheme: light; --ink: #17202a; --dim: #5d6d7e; --line: #d9e0e6; --bad: #d62728; --brand: #1f6fb2; }
@@ -34,10 +36,12 @@ svg polyline { fill: none; stroke: var(--brand); stroke-width: 1.6; } svg text {
 """
 
 
-def page(paths: Sequence[Path]) -> str:
-    """The page of these sessions. Raises RecordingError for a folder that holds none, or one of another schema."""
+def page(paths: Sequence[Path], *, unblind: bool = False) -> str:
+    """The page of these sessions; `unblind` names the methods of a blinded plan that is not done. Raises RecordingError
+    for a folder that holds none, or one of another schema."""
     sessions = [read_session(path) for path in paths]
-    found = groups(sessions)
+    planned = plans(sessions, unblind=unblind)
+    found = groups(sessions, {method: letter for plan in planned for method, letter in plan.names.items()})
     title = f"{sessions[0].header.session}" if len(sessions) == 1 else f"{len(sessions)} sessions"
     cards: list[str] = []
     timing: list[str] = []
@@ -51,6 +55,7 @@ def page(paths: Sequence[Path]) -> str:
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
         f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head><body>',
         f"<h1>{html.escape(title)}</h1>{_sessions(sessions)}",
+        *(_plan(plan) for plan in planned),
         f"<h2>Success by attempt</h2>{_success(found)}{_plot(found)}",
         f"<h2>Paired differences</h2>{_differences(found)}",
         f"<h2>Timing</h2>{_table(['session', 'ticks', 'lateness p50', 'p99', 'max, ms', 'starved'], timing)}",
@@ -99,6 +104,32 @@ def _sessions(sessions: Sequence[SessionRecording]) -> str:
     return _table(["session", "task", "method", "policy", "started", "trials"], [_row(row) for row in rows])
 
 
+def _plan(plan: Planned) -> str:
+    """Each method within its own attempts, on the scenes that both have."""
+    shown = plan.shown
+    state = f"{shown.done} of {shown.total} trials done, {plan.left_out} begun and left out"
+    if shown.blind:
+        state += "; blinded: the methods are told by letters until all are done (--unblind tells them now)"
+    rows = [
+        _row([d.left + " − " + d.right, str(d.pairs), f"{100 * d.mean:+.0f}",
+              f"[{100 * d.low:+.0f}, {100 * d.high:+.0f}]" if d.high > d.low and d.pairs > 1 else "–",
+              str(d.only_left), str(d.only_right), f"{d.p:.3g}", to_go(d.left_to_go, shown.precision)])
+        for d in shown.differences
+    ]  # fmt: skip
+    head = ["all attempts", "pairs", "points", "95 %", "only left", "only right", "McNemar p", "precision"]
+    letters = ", ".join(f"{letter} was {name}" for letter, name in shown.revealed)
+    rates = [
+        _row([a.label, str(a.trials), f"{a.solved[-1]}/{a.trials}: {100 * a.solved[-1] / a.trials:.0f} % "
+              f"[{100 * a.low[-1]:.0f}, {100 * a.high[-1]:.0f}]" if a.trials else "–"])
+        for a in shown.arms
+    ]  # fmt: skip
+    return (
+        f"<h2>The plan {html.escape(shown.name)}</h2><p>{html.escape(state)}.</p>"
+        f"{_table(['method', 'trials', 'solved'], rates)}{_table(head, rows)}"
+        f'<p class="dim">Pairs are trials of the same scene and repetition. {html.escape(letters)}</p>'
+    )
+
+
 def _success(found: Sequence[Group]) -> str:
     last = max(group.max_attempts for group in found)
     rows = []
@@ -113,7 +144,8 @@ def _success(found: Sequence[Group]) -> str:
         rows.append(_row([*cells, f"{np.mean(attempts):.2f}" if attempts else "–"]))
     head = ["method", "trials", "left out", *(f"within {k}" for k in range(1, last + 1)), "attempts a trial"]
     note = (
-        "Brackets: 95 % Wilson intervals. Left out, and in no figure: trials skipped, cut off, begun at reduced speed."
+        "Brackets: 95 % Wilson intervals. Left out, and in no figure: trials skipped, cut off, begun at reduced speed, "
+        "helped by a person."
     )
     return f'{_table(head, rows)}<p class="dim">{note}</p>'
 

@@ -11,6 +11,7 @@ from far_app.learning.critic import Critic, CriticShape, expectile_loss, eyes_of
 from far_app.learning.critic_file import load_critic, load_demonstrations, read_card, save_critic
 from far_app.learning.critic_source import Features, Pictures, encoded
 from far_app.learning.dataset import Episode
+from far_app.learning.memory import FeatureMemory
 from far_app.learning.train_critic import CriticTraining, fit, train_critic
 from far_app.learning.transitions import Backup, EncodedEpisode, Transitions, chunked, joined, labelled, transitions
 from tests.learning.small import SIZE, small_attempt, small_policy
@@ -268,7 +269,7 @@ def test_an_own_encoder_is_trained_saved_and_used(tmp_path):
     attempt = small_attempt(ticks=9)
     histories = [(attempt.steps[0].observation, attempt.steps[1].observation)]
     features = policy.encode(histories)
-    assert not torch.allclose(critic.see(histories, features), features, atol=1e-4)
+    assert not torch.allclose(critic.see(histories, features, FeatureMemory()), features, atol=1e-4)
     assert sum(v.numel() for v in critic.state_dict().values()) > sum(p.numel() for p in policy.encoder.parameters())
 
 

@@ -1,6 +1,8 @@
-"""OpenVINO gives what torch gives, on the weights it was made with, whatever was compiled before."""
+"""Every engine is the reference, on the weights it was asked for; one that is not is refused, said, and replaced."""
 
 import copy
+import dataclasses
+import logging
 
 import numpy as np
 import pytest
@@ -8,66 +10,204 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from far_app.errors import ConfigError
-from far_app.learning import engines, openvino_unet
-from far_app.learning.fast_unet import FastUnet
+from far_app.errors import ConfigError, PolicyError
+from far_app.learning.engines import ENGINES, Choice, EngineError, Entry, order_of, take
+from far_app.learning.engines.cuda_graph import CudaGraphEngine
+from far_app.learning.engines.openvino_unet import available
+from far_app.learning.engines.reference import ReferenceEngine
+from far_app.learning.engines.taking import check, probe
+from far_app.learning.policy import DiffusionPolicy, preset
 from far_app.learning.runtime import ActingPolicy
+from far_app.protocols import PlanRequest
+from far_app.session.planners import plan_one
 from tests.learning.small import small_attempt, small_policy
 
-needs_openvino = pytest.mark.skipif(not openvino_unet.available(), reason="pip install openvino")
+needs_openvino = pytest.mark.skipif(not available(), reason="OpenVINO is not installed: pip install openvino")
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA GPU here")
+HISTORY = tuple(s.observation for s in small_attempt(2).steps)
+NOISE = np.random.default_rng(0).standard_normal((1, 8, 7)).astype(np.float32)
 
 
-def same(policy, other=None, batch: int = 1, seed: int = 0) -> bool:
-    """Whether both engines denoise alike; the first of `policy`, the second of `other`."""
+def policy(encoder: str = "light", seed: int = 0, norm: str = "group") -> DiffusionPolicy:
     torch.manual_seed(seed)
-    noisy, k = torch.randn(batch, 8, 7), torch.randint(0, 100, (batch,))
-    features = torch.randn(batch, policy.feature_dim)
-    found = []
-    for network, engine in ((policy, "torch"), (other or policy, "openvino")):
-        run = engines.runner(network.denoiser, 8, engine)
-        with torch.inference_mode():
-            found.append(run.run(noisy, k, run.condition(features)))
-    return bool(torch.allclose(*found, atol=1e-4))
+    size = {"light": 16, "resnet18": 40, "none": 84}[encoder]
+    config = dataclasses.replace(
+        preset("state" if encoder == "none" else "quickstart", "lift"),
+        encoder=encoder, image_size=size, widths=(16, 32), ddim_steps=4, norm=norm,
+    )  # fmt: skip
+    network = DiffusionPolicy(config).eval().requires_grad_(False)
+    for module in network.encoder.modules():  # statistics that a trained network would have
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.running_mean.normal_(std=0.1)
+            module.running_var.uniform_(0.5, 2.0)
+    return network
 
 
-@needs_openvino
-@settings(max_examples=10, deadline=None)
-@given(batch=st.integers(1, 10), seed=st.integers(0, 1000))
-def test_both_engines_denoise_alike(batch, seed):
-    assert same(small_policy(seed % 3), batch=batch, seed=seed)
-
-
-@needs_openvino
-def test_adapted_weights_are_the_ones_that_act():
-    """The graph is shared by all weights of an architecture; each runner reads its own."""
-    base = small_policy()
-    adapted = copy.deepcopy(base)
+def moved(network: DiffusionPolicy, by: float = 0.05) -> DiffusionPolicy:
+    """With other denoiser weights; the encoder is the same."""
+    other = copy.deepcopy(network)
     with torch.no_grad():
-        for parameter in adapted.denoiser.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))
-    before = engines.runner(base.denoiser, 8, "openvino")
-    assert same(adapted) and same(base)
-    assert not same(base, adapted)
-    arguments = (
-        torch.zeros(1, 8, 7),
-        torch.zeros(1, dtype=torch.long),
-        before.condition(torch.zeros(1, base.feature_dim)),
-    )
-    assert torch.allclose(before.run(*arguments), FastUnet(base.denoiser, 8).run(*arguments), atol=1e-4)
+        for parameter in other.denoiser.parameters():
+            parameter.add_(by * torch.randn_like(parameter))
+    return other
+
+
+def on_this_machine() -> list[str]:
+    return [n for n, e in ENGINES.items() if not e.unusable(small_policy())]
+
+
+@pytest.mark.parametrize(
+    "encoder,norm", [("light", "group"), ("resnet18", "group"), ("resnet18", "batch"), ("none", "group")]
+)
+@pytest.mark.parametrize("name", [n for n in ENGINES if n != "cuda-graph"])
+def test_an_engine_is_the_reference_alone_in_a_batch_and_pushed(name, encoder, norm):
+    network, entry = policy(encoder, norm=norm), ENGINES[name]
+    if why := entry.unusable(network):
+        pytest.skip(f"{name}: {why}")
+    engine, reference = entry.make(network, "v", False), ReferenceEngine(network, "v")
+    for batch in (1, 3, 10):
+        histories, noise = probe(network, batch)
+        expected, chunks = reference.plan(histories, noise)
+        found = engine.plan(histories, noise)
+        assert torch.allclose(found[0], expected, atol=max(entry.tolerance, 1e-6))
+        assert torch.allclose(found[1], chunks, atol=max(entry.tolerance, 1e-6))
+        assert torch.allclose(engine.encode(histories), expected, atol=max(entry.tolerance, 1e-6))
+        pushed = [e.sample(expected, noise, push=lambda clean: clean + 0.3) for e in (engine, reference)]
+        assert torch.allclose(*pushed, atol=max(entry.tolerance, 1e-6))
+        assert not torch.allclose(pushed[1], chunks, atol=1e-2)
+
+
+@pytest.mark.parametrize("encoder", ["light", "resnet18", "none"])
+@pytest.mark.parametrize("dtype,tolerance", [(torch.float32, 1e-4), (torch.bfloat16, 5e-2)])
+def test_the_cuda_program_run_eagerly_is_the_reference(encoder, dtype, tolerance):
+    """Its static buffers, its precomputed FiLM and its low-precision encoder, without a GPU."""
+    network = policy(encoder)
+    engine, reference = CudaGraphEngine(network, "v", dtype), ReferenceEngine(network, "v")
+    check(engine, reference, tolerance, batch=3)
+    first, second = (probe(network, 2), (list(reversed(probe(network, 2)[0])), torch.zeros(2, 8, 7)))
+    kept = engine.plan(*first)
+    engine.plan(*second)  # the same buffers
+    assert torch.allclose(kept[1], reference.plan(*first)[1], atol=tolerance), "a later plan overwrote an earlier one"
+    assert torch.allclose(engine.plan(*second)[1], reference.plan(*second)[1], atol=tolerance)
+    other = moved(network)
+    check(engine.adapted(other, "v2"), ReferenceEngine(other, "v2"), tolerance, denoiser_only=True)
+    check(engine, reference, tolerance)
+
+
+@needs_cuda
+@pytest.mark.parametrize("encoder", ["light", "resnet18", "none"])
+def test_a_captured_graph_is_the_reference(encoder):
+    network = policy(encoder).to("cuda")
+    engine, reference = CudaGraphEngine(network, "v"), ReferenceEngine(network, "v")
+    check(engine, reference, ENGINES["cuda-graph"].tolerance, batch=4)
+    other = moved(network)
+    check(engine.adapted(other, "v2"), ReferenceEngine(other, "v2"), ENGINES["cuda-graph"].tolerance, batch=4)
+    check(engine, reference, ENGINES["cuda-graph"].tolerance)
+
+
+@pytest.mark.parametrize("name", on_this_machine())
+@settings(max_examples=5, deadline=None)
+@given(seed=st.integers(0, 1000), batch=st.integers(1, 9))
+def test_after_an_adaptation_each_version_runs_its_own_weights(name, seed, batch):
+    """Graphs are shared by all weights of an architecture; each engine reads its own."""
+    base = policy(seed=seed % 3)
+    torch.manual_seed(seed)
+    other, tolerance = moved(base), max(ENGINES[name].tolerance, 1e-6)
+    before = ENGINES[name].make(base, "base", False)
+    after = before.adapted(other, "base+a1")
+    features, noise = torch.randn(batch, base.feature_dim), torch.randn(batch, 8, 7)
+    for engine, network in ((after, other), (before, base), (after, other)):
+        expected = ReferenceEngine(network, "").sample(features, noise)
+        assert torch.allclose(engine.sample(features, noise), expected, atol=tolerance)
+    assert (before.version, after.version) == ("base", "base+a1")
+
+
+class Stubborn(ReferenceEngine):
+    """Goes on with the weights it has, whatever it is asked."""
+
+    name = "stubborn"
+
+    def adapted(self, network, version):
+        return self
+
+
+class Lying(Stubborn):
+    """… and says it has the new ones."""
+
+    def adapted(self, network, version):
+        liar = Lying(self.network, version)
+        return liar
+
+
+class Wrong(ReferenceEngine):
+    def sample(self, features, noise, push=None):
+        return super().sample(features, noise, push) + 1e-3
+
+
+def unbuildable(network, version, each_alone):
+    raise EngineError("no such instruction")
+
+
+def entry(make, name: str = "stubborn") -> Entry:
+    return Entry(name=name, summary="", make=make, unusable=lambda network: "", tolerance=1e-4)
+
+
+@pytest.mark.parametrize("kind,why", [(Stubborn, "weights of version base, not of base.a1"), (Lying, "differs")])
+def test_a_retry_never_runs_on_old_weights(kind, why, monkeypatch):
+    monkeypatch.setitem(ENGINES, "stubborn", entry(kind))
+    base, choice = small_policy(), Choice(order=("stubborn", "arranged"))
+    other = moved(base)
+    before = take(base, "base", choice)
+    assert before.report.name == "stubborn"
+    after = take(other, "base+a1", choice, base=before)
+    assert after.report.name == "arranged"
+    assert len(after.report.refused) == 1
+    with pytest.raises(EngineError, match=why):
+        check(before.engine.adapted(other, "base+a1"), ReferenceEngine(other, "base+a1"), 1e-4, denoiser_only=True)
+
+
+def test_a_chunk_of_another_version_than_the_policy_that_was_asked_is_refused():
+    acting = ActingPolicy(small_policy(), "base", engine="torch")
+    acting.version = "base+a1"
+    with pytest.raises(PolicyError, match=r"policy base\+a1 was asked at tick 4.*weights of base answered"):
+        plan_one(PlanRequest(history=HISTORY, tick=4, noise_key=(0, 1, 4), policy=acting))
+
+
+@pytest.mark.parametrize("make,why", [(Wrong, "chunk differs from the reference by 0.001"), (unbuildable, "no such")])
+def test_an_engine_that_fails_is_refused_once_with_its_error_and_the_next_is_taken(make, why, monkeypatch, caplog):
+    monkeypatch.setitem(ENGINES, "bad", entry(make, "bad"))
+    base, choice = small_policy(), Choice(order=("bad", "arranged", "torch"), why="measured")
+    with caplog.at_level(logging.WARNING):
+        taken = take(base, "base", choice)
+        again = take(moved(base), "base+a1", choice, base=taken)
+    assert (taken.report.name, again.report.name) == ("arranged", "arranged")
+    assert why in taken.report.refused[0]
+    assert again.report.refused == taken.report.refused
+    assert len([r for r in caplog.records if "bad" in r.getMessage()]) == 1
+
+
+def test_with_every_engine_refused_the_reference_acts(monkeypatch):
+    monkeypatch.setitem(ENGINES, "bad", entry(Wrong, "bad"))
+    network = small_policy()
+    acting = ActingPolicy(network, "base", engine=Choice(order=("bad",)))
+    assert acting.runs_on.name == "torch"
+    (chunk,) = acting.plan([HISTORY], [1], NOISE)
+    expected = network.sample(network.encode([HISTORY]), torch.from_numpy(NOISE))[0]
+    assert np.array_equal(chunk.actions, expected.numpy())
+
+
+def test_what_was_asked_for_and_cannot_run_says_what_to_do(monkeypatch):
+    with pytest.raises(ConfigError, match="unknown engine 'gpu'; choose one of: auto, cuda-graph, openvino"):
+        order_of("gpu", small_policy())
+    with pytest.raises(ConfigError, match="engine cuda-graph was asked for, but the policy is on cpu"):
+        order_of("cuda-graph", small_policy())
+    monkeypatch.setattr("far_app.learning.engines.openvino_engine.available", lambda: False)
+    with pytest.raises(ConfigError, match="pip install openvino"):
+        order_of("openvino", small_policy())
+    assert order_of("auto", small_policy()).order == ("arranged", "torch")
 
 
 @needs_openvino
-def test_the_acting_policy_plans_the_same_chunk_under_either_engine():
-    policy, attempt = small_policy(), small_attempt()
-    history = (attempt.steps[0].observation, attempt.steps[1].observation)
-    noise = np.random.default_rng(0).standard_normal((1, 8, 7)).astype(np.float32)
-    (a,), (b,) = (ActingPolicy(policy, "v", engine=e).plan([history], [1], noise) for e in ("torch", "openvino"))
-    assert np.allclose(a.actions, b.actions, atol=1e-4)
-
-
-def test_without_openvino_auto_is_torch_and_asking_for_it_says_what_to_do(monkeypatch):
-    monkeypatch.setattr(openvino_unet, "available", lambda: False)
-    assert isinstance(engines.runner(small_policy().denoiser, 8), FastUnet)
-    assert engines.chosen() == "torch"
-    with pytest.raises(ConfigError, match="pip install openvino"):
-        engines.runner(small_policy().denoiser, 8, "openvino")
+def test_lower_precision_is_never_taken_by_itself():
+    assert "openvino-bf16" not in order_of("auto", small_policy()).order
+    assert order_of("openvino-bf16", small_policy()).order[:2] == ("openvino-bf16", "openvino")

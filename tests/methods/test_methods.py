@@ -14,6 +14,7 @@ from far_app.errors import ConfigError, FarError
 from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.preference import Demonstrations
 from far_app.learning.runtime import ActingPolicy
+from far_app.learning.trainable import plain, trainable
 from far_app.methods import METHODS, Ingredients, method
 from far_app.methods.evidence import history, sent_chunks
 from far_app.protocols import Method
@@ -91,7 +92,7 @@ def test_an_adaptation_reports_its_evidence():
     assert (attributed.flagged, attributed.pairs) == (adaptation.flagged, 0), "flags are told before pairs are sought"
     assert (paired.flagged, paired.pairs) == (adaptation.flagged, 12)
     assert tuple(steps) == adaptation.history
-    assert set(adaptation.seconds) == {"attribution", "encoding", "candidates", "pairs", "update"}
+    assert set(adaptation.seconds) == {"attribution", "encoding", "candidates", "pairs", "update", "engine"}
 
 
 def test_an_adaptation_keeps_its_positives_best_first_within_a_recording():
@@ -163,6 +164,28 @@ def test_the_same_scene_and_attempt_teach_the_same_lesson():
     adapt(one)
     adapt(two)
     assert np.array_equal(plan(one), plan(two))
+
+
+def test_the_plain_form_teaches_the_same_lesson():
+    """Candidates, pairs, errors and weights; the networks are small and the steps so too, for Adam divides by √v."""
+    config = dataclasses.replace(QUICK, fcpa=dataclasses.replace(QUICK.fcpa, lr=1e-4))
+    lessons = []
+    for arrange in (trainable, plain):
+        network = small_policy()
+        critic = small_critic(network)
+        m = method("fcpa", Ingredients(
+            network=network, critic=critic, config=config, arrange=arrange,
+            act=lambda net, version, steering=None: ActingPolicy(net, version, None, "torch", steering),
+        ))  # fmt: skip
+        lessons.append((adapt(m), plan(m)))
+    (fast, fast_chunk), (slow, slow_chunk) = lessons
+    assert fast.pairs == slow.pairs > 0
+    for a, b in zip(fast.contrasts, slow.contrasts, strict=True):
+        assert np.allclose(a.positives, b.positives, atol=1e-4)
+    for a, b in zip(fast.history, slow.history, strict=True):
+        assert np.allclose((a.loss, a.winner_error, a.loser_error), (b.loss, b.winner_error, b.loser_error), rtol=1e-3)
+    assert np.allclose(fast_chunk, slow_chunk, atol=1e-3)
+    assert not np.allclose(fast_chunk, plan(made("nr")), atol=1e-3)
 
 
 def test_a_hedged_lesson_that_failed_is_withdrawn_for_one_attempt_and_remembered():

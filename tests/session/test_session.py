@@ -12,7 +12,7 @@ import pytest
 from far_app.detectors import PersonJudge, TwinCheck
 from far_app.errors import RecordingError
 from far_app.motion import ActionScale
-from far_app.protocols import Hold, Home, Resume
+from far_app.protocols import EngineReport, Hold, Home, Resume
 from far_app.recording.inspect import inspect_session
 from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
@@ -34,9 +34,9 @@ class Desk:
     """A session with everything a test may want to touch."""
 
     def __init__(self, robot=None, policy=None, adapting_seconds=0.0, horizon=20, attempts=3, detector=None,
-                 writer=None, **settings) -> None:  # fmt: skip
+                 writer=None, method=None, course=None, **settings) -> None:  # fmt: skip
         self.robot = robot or KinematicRobot()
-        self.method = Faster(policy or Forward(), adapting_seconds)
+        self.method = method or Faster(policy or Forward(), adapting_seconds)
         self.inbox = IntentInbox()
         self.statistics = LoopStatistics()
         settings = {"name": "test", "trials": 1, "seed": 5, "headless": True} | settings
@@ -44,6 +44,7 @@ class Desk:
             settings=SessionSettings(**settings), robot=self.robot, planner=ThreadedPlanner(), method=self.method,
             detector=detector or TwinCheck(2), scale=ActionScale(), recorder=Recorder(writer), inbox=self.inbox,
             task=replace(task("lift"), horizon=horizon, max_attempts=attempts, rate=50.0), statistics=self.statistics,
+            course=course,
         )  # fmt: skip
 
     @property
@@ -252,8 +253,7 @@ def test_the_page_sees_the_flags_while_the_arm_goes_home():
             time.sleep(0.2)
             return replace(known, status="empty", flagged=(1,))
 
-    desk = Desk(policy=Forward(speed=0.01), horizon=5, attempts=2)
-    desk.session.method = desk.method = Telling(Forward(speed=0.01))
+    desk = Desk(method=Telling(Forward(speed=0.01)), horizon=5, attempts=2)
     shown = []
     desk.session.standing.show = lambda: shown.append(desk.session.board.telemetry(desk.state, None))
     desk.session.run()
@@ -297,3 +297,16 @@ def test_stop_while_a_person_is_asked_ends_the_attempt():
     desk.when(lambda: desk.state is State.STOPPED, lambda: desk.inbox.put(Intent.RESUME))
     (result,) = desk.session.run()
     assert (result.success, result.judged_by) == (False, "operator")
+
+
+def test_what_runs_the_policy_is_shown_and_a_refused_engine_is_told_once():
+    class OnEngine(Forward):
+        runs_on = EngineReport(name="arranged", why="fastest here", refused=("openvino: it differs by 0.1",))
+
+    desk = Desk(policy=OnEngine(), trials=2)
+    desk.session.run()
+    shown = desk.session.board.telemetry(desk.state, None)
+    assert (shown.engine, shown.engine_refused) == ("arranged", ("openvino: it differs by 0.1",))
+    told = [line for line in shown.log if "refused" in line.text]
+    assert [line.level for line in told] == ["warning"]
+    assert told[0].text == "engine refused, openvino: it differs by 0.1; arranged runs the policy"

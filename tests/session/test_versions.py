@@ -52,10 +52,8 @@ class Keeping(Faster):
 
 
 def desk(attempts=3, trials=1, adapting_seconds=0.0, **settings) -> Desk:
-    made = Desk(horizon=8, attempts=attempts, trials=trials, headless=False, policy=Forward(speed=0.02), **settings)
     method = Keeping(Forward(speed=0.02), adapting_seconds)
-    made.method = made.session.method = method
-    made.session.versions._method = method
+    made = Desk(horizon=8, attempts=attempts, trials=trials, headless=False, method=method, **settings)
     made.acted, before = [], made.session._attempt_ended
 
     def ended(event):

@@ -54,18 +54,18 @@ def test_the_last_word_counts_and_a_trial_cut_short_is_in_no_figure(tmp_path):
         tmp_path, SessionInfo(task="lift", method="far", config={"task": {"max_attempts": 3}}),
         space_to_start=0, space_to_go_on=0,
     )  # fmt: skip
-    for trial in (1, 2, 3):
+    for trial in (1, 2, 3, 4):
         writer.begin_trial(trial, trial)
         writer.begin_attempt(1, "base")
-        if trial == 3:
-            writer.event("reduced_speed")
+        if trial > 2:
+            writer.event({3: "reduced_speed", 4: "taken_over"}[trial])
         writer.end_attempt(values.attempt(1, 1))
         if trial != 2:
             writer.mark(Outcome(success=True, judged_by=Judge.OPERATOR))
         writer.end_trial(success=trial != 2, attempts=1)
     writer.close()
     [group] = groups([read_session(writer.folder)])
-    assert [t.solved_by for t in group.trials] == [1] and group.unfinished == 2
+    assert [t.solved_by for t in group.trials] == [1] and group.unfinished == 3
 
 
 def test_the_page_is_whole_in_itself_and_shows_each_failures_flagged_moment(tmp_path, monkeypatch, capsys):

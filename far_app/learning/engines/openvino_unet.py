@@ -2,8 +2,7 @@
 
 The graph is built once for an architecture and a batch size, from operations, without a converter; the weights are its
 inputs, not its constants, so that an adapted policy runs on its own weights at once, with nothing compiled anew.
-`far_app/learning/fast_unet.py` stays the reference; a test holds the two equal to 1e-4. Used by the acting policy where
-the openvino package is installed (`available`).
+Called by openvino_engine.
 """
 
 from __future__ import annotations
@@ -85,19 +84,24 @@ def _compiled(
     """The compiled graph of this architecture; one for all of its weights."""
     key = (repr(unet), chunk, film, tuple(shapes), threads)
     if key not in _GRAPHS:
-        settings = {
-            "INFERENCE_NUM_THREADS": threads, "PERFORMANCE_HINT": "LATENCY", "INFERENCE_PRECISION_HINT": "f32",
-            "NUM_STREAMS": 1,
-        }  # fmt: skip
-        _GRAPHS[key] = _core().compile_model(_Builder(unet, chunk, film, shapes).model(), "CPU", settings)
+        graph = _Builder(unet, chunk, film, shapes).model()
+        _GRAPHS[key] = core().compile_model(graph, "CPU", settings("f32", threads))
     return _GRAPHS[key]
 
 
 @functools.cache
-def _core() -> Any:
+def core() -> Any:
     import openvino
 
     return openvino.Core()
+
+
+def settings(precision: str, threads: int) -> dict[str, Any]:
+    """One inference as soon as possible, on so many threads; precision is "f32" or "bf16"."""
+    return {
+        "INFERENCE_NUM_THREADS": threads, "PERFORMANCE_HINT": "LATENCY", "INFERENCE_PRECISION_HINT": precision,
+        "NUM_STREAMS": 1,
+    }  # fmt: skip
 
 
 class _Builder:
@@ -166,9 +170,15 @@ class _Builder:
             x = ops.reshape(self._affine(flat, matrix, bias), [self.batch, 2, -1], special_zero=False)
         else:
             x = self._affine(self._taps(x), matrix, bias)
-        channels_first = ops.transpose(x, [0, 2, 1])
-        normal = ops.group_normalization(channels_first, scale, offset, block[1].num_groups, block[1].eps)
-        return ops.mish(ops.transpose(normal, [0, 2, 1]))
+        return ops.mish(ops.add(ops.multiply(self._normalised(x, block[1]), scale), offset))
+
+    def _normalised(self, x: Any, norm: nn.GroupNorm) -> Any:
+        """Mean 0 and variance 1 in each group of channels. OpenVINO 2026.4's own GroupNormalization takes the process
+        down when some residual networks compile."""
+        ops, length = self.ops, self._length(x)
+        grouped = ops.reshape(x, [self.batch, length, norm.num_groups, -1], special_zero=False)
+        normal = ops.mvn(grouped, [1, 3], True, norm.eps, "INSIDE_SQRT")
+        return ops.reshape(normal, [self.batch, length, norm.num_channels], special_zero=False)
 
     def _residual(self, x: Any, block: Any, weights: Iterator[Any], film: Any) -> Any:
         ops = self.ops

@@ -1,0 +1,126 @@
+"""A camera's network (far_app/learning/encoder.py) through OpenVINO, one picture at a time.
+
+The graph is built from operations, without a converter: a quarter of a second where tracing takes two. The weights are
+its constants: encoders are frozen while a policy acts. GroupNorm is written as MVN over a group, then scale and offset;
+OpenVINO 2026.4's own GroupNormalization takes the process down when a residual network compiles.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+
+from far_app.errors import FarError
+from far_app.learning.encoder import LightCamera, ObservationEncoder, ResNet18Camera, SpatialSoftmax
+from far_app.learning.engines.openvino_unet import core, settings
+
+
+class OpenVinoCameras:
+    """ObservationEncoder.camera_features through OpenVINO. Not for several threads at once."""
+
+    def __init__(self, encoder: ObservationEncoder, image_size: int, precision: str, threads: int = 1) -> None:
+        self._requests = {
+            (camera, place): _request(net, image_size, precision, threads)
+            for camera in encoder.camera_names
+            for place, net in enumerate(encoder.networks(camera))
+        }
+        self._shared = not encoder.per_frame
+
+    def __call__(self, camera: str, place: int, images: UInt8[Tensor, "B S S 3"]) -> Float[Tensor, "B D"]:
+        request, pixels = self._requests[camera, 0 if self._shared else place]
+        rows = []
+        for image in images.numpy():
+            pixels[0] = image
+            request.infer()
+            rows.append(request.get_output_tensor(0).data.copy())
+        return torch.from_numpy(np.concatenate(rows))
+
+
+def _request(net: nn.Module, size: int, precision: str, threads: int) -> tuple[Any, np.ndarray]:
+    """An inference request and the picture it reads."""
+    import openvino
+
+    compiled = core().compile_model(camera_graph(net, size), "CPU", settings(precision, threads))
+    request = compiled.create_infer_request()
+    pixels = np.zeros((1, size, size, 3), np.uint8)
+    request.set_input_tensor(0, openvino.Tensor(pixels, shared_memory=True))
+    return request, pixels
+
+
+def camera_graph(net: nn.Module, size: int) -> Any:
+    """uint8 (1, S, S, 3) → features (1, D). FarError for a network that is not one of encoder.py's."""
+    import openvino
+    from openvino import opset13 as ops
+
+    pixels = ops.parameter([1, size, size, 3], np.uint8, name="pixels")
+    x = ops.transpose(ops.convert(pixels, "f32"), [0, 3, 1, 2])
+    build = _Layers(ops)
+    if isinstance(net, LightCamera):
+        x = ops.subtract(ops.multiply(x, np.float32(1 / 127.5)), np.float32(1))
+        x = build.positions(build.sequence(x, net.net), net.softmax)
+    elif isinstance(net, ResNet18Camera):
+        x = ops.multiply(ops.subtract(ops.multiply(x, np.float32(1 / 255)), build.constant(net.mean)),
+                         build.constant(1 / net.std))  # fmt: skip
+        x = ops.relu(build.norm(build.convolution(x, net.conv1), net.bn1))
+        x = ops.max_pool(x, [2, 2], [1, 1], [1, 1], [1, 1], [3, 3]).output(0)
+        for layer in (net.layer1, net.layer2, net.layer3, net.layer4):
+            for block in layer:
+                x = build.residual(x, block)
+        x = build.positions(build.convolution(x, net.keypoints), net.softmax)
+        x = ops.add(ops.matmul(x, build.constant(net.head.weight), False, True), build.constant(net.head.bias))
+    else:
+        raise FarError(f"{type(net).__name__} is no camera network that the openvino engine knows; take another engine")
+    make: Any = openvino.Model
+    return make([x], [pixels], "camera")
+
+
+class _Layers:
+    """Torch's layers as OpenVINO's operations; x is (1, C, H, W)."""
+
+    def __init__(self, ops: Any) -> None:
+        self.ops = ops
+
+    def constant(self, weight: Tensor) -> Any:
+        return self.ops.constant(np.ascontiguousarray(weight.detach().numpy()))
+
+    def convolution(self, x: Any, layer: nn.Conv2d) -> Any:
+        padding, stride = list(layer.padding), list(layer.stride)
+        y = self.ops.convolution(x, self.constant(layer.weight), stride, padding, padding, list(layer.dilation))
+        return y if layer.bias is None else self.ops.add(y, self.constant(layer.bias.view(1, -1, 1, 1)))
+
+    def norm(self, x: Any, layer: nn.Module) -> Any:
+        """GroupNorm, or BatchNorm as it is in evaluation."""
+        ops = self.ops
+        if isinstance(layer, nn.GroupNorm):
+            shape = list(x.output(0).get_shape())
+            flat = ops.reshape(x, [1, layer.num_groups, -1], special_zero=False)
+            normal = ops.mvn(flat, [2], True, layer.eps, "INSIDE_SQRT")
+            y, scale, offset = ops.reshape(normal, shape, special_zero=False), layer.weight, layer.bias
+        else:
+            batch: Any = layer
+            y, scale = x, batch.weight * torch.rsqrt(batch.running_var + batch.eps)
+            offset = batch.bias - batch.running_mean * scale
+        return ops.add(ops.multiply(y, self.constant(scale.view(1, -1, 1, 1))), self.constant(offset.view(1, -1, 1, 1)))
+
+    def residual(self, x: Any, block: Any) -> Any:
+        down = block.downsample
+        shortcut = x if down is None else self.norm(self.convolution(x, down[0]), down[1])
+        y = self.ops.relu(self.norm(self.convolution(x, block.conv1), block.bn1))
+        y = self.norm(self.convolution(y, block.conv2), block.bn2)
+        return self.ops.relu(self.ops.add(y, shortcut))
+
+    def sequence(self, x: Any, layers: nn.Sequential) -> Any:
+        for layer in layers:
+            x = self.convolution(x, layer) if isinstance(layer, nn.Conv2d) else self.ops.relu(x)
+        return x
+
+    def positions(self, maps: Any, softmax: SpatialSoftmax) -> Any:
+        """(1, C, H, W) → (1, 2C): the mean coordinate under each map's softmax."""
+        ops, channels = self.ops, int(maps.output(0).get_shape()[1])
+        weights = ops.softmax(ops.reshape(maps, [1, channels, -1], special_zero=False), 2)
+        return ops.reshape(ops.matmul(weights, self.constant(softmax.grid), False, False), [1, 2 * channels],
+                           special_zero=False)  # fmt: skip

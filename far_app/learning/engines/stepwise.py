@@ -1,0 +1,108 @@
+"""An engine made of two parts: camera features frame by frame, and a denoiser that is called at every DDIM step.
+
+An observation's camera features are computed once where the encoder shares its weights over the frames: the next tick
+finds the previous frame's already there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from far_app.learning.diffusion import ddim_sample
+from far_app.learning.engines.protocol import Push
+from far_app.learning.memory import FeatureMemory
+from far_app.learning.policy import DiffusionPolicy
+from far_app.protocols import History
+from far_app.types import Observation
+
+KEPT_FRAMES = 64
+"""Observations whose camera features are kept: a history each for a few dozen robots."""
+
+CameraFeatures = Callable[[str, int, UInt8[Tensor, "B S S 3"]], Float[Tensor, "B D"]]
+"""Of one camera's pictures at one place in the history (0 oldest)."""
+
+
+class Denoiser(Protocol):
+    """ε_θ under fixed weights."""
+
+    def condition(self, features: Float[Tensor, "S F"]) -> Tensor:
+        """The observation's part, once a state."""
+        ...
+
+    def run(self, noisy: Float[Tensor, "B H A"], k: Int[Tensor, "B"], condition: Tensor) -> Float[Tensor, "B H A"]:
+        """ε_θ(a_k, s, k), one row of `condition` each."""
+        ...
+
+
+class Frames:
+    """Features of histories from a function for one camera's pictures."""
+
+    def __init__(self, network: DiffusionPolicy, camera_features: CameraFeatures, each_alone: bool) -> None:
+        self.network, self.camera_features, self.each_alone = network, camera_features, each_alone
+        self._kept = FeatureMemory(KEPT_FRAMES)
+
+    def features(self, histories: Sequence[History]) -> Float[Tensor, "B F"]:
+        network = self.network
+        places = range(network.config.n_obs)
+        state = network.normalizer(network.states(histories))
+        if not network.config.cameras:
+            return network.encoder.join([[] for _ in places], state)
+        if network.encoder.per_frame:
+            seen = [self._cameras([h[t] for h in histories], t) for t in places]
+        else:
+            frames = [h[t] for t in places for h in histories]
+            self._kept.room_for(2 * len(frames))
+            known = self._kept.of([(o,) for o in frames], lambda new: self._cameras([o for (o,) in new], 0))
+            seen = known.split(len(histories))
+        each = [list(s.split(network.encoder.frame_dim, dim=1)) for s in seen]
+        return network.encoder.join(each, state)
+
+    def _cameras(self, observations: Sequence[Observation], place: int) -> Float[Tensor, "B C*D"]:
+        """All cameras' features of these observations, side by side."""
+        size = 1 if self.each_alone else len(observations)
+        device = self.network.normalizer.low.device
+        rows = []
+        for first in range(0, len(observations), size):
+            some = observations[first : first + size]
+            rows.append(torch.cat([
+                self.camera_features(c, place, torch.from_numpy(np.stack([o.images[c] for o in some])).to(device))
+                for c in self.network.config.cameras
+            ], dim=1))  # fmt: skip
+        return torch.cat(rows)
+
+
+class StepwiseEngine:
+    """far_app.learning.engines.Engine."""
+
+    def __init__(
+        self, name: str, network: DiffusionPolicy, version: str, frames: Frames,
+        denoiser: Callable[[DiffusionPolicy], Denoiser],
+    ) -> None:  # fmt: skip
+        """`denoiser` makes the fast form of a network's present weights."""
+        self.name, self.network, self.version, self.frames = name, network, version, frames
+        self._make_denoiser = denoiser
+        self.denoiser = denoiser(network)
+
+    @torch.no_grad()
+    def encode(self, histories: Sequence[History]) -> Float[Tensor, "B F"]:
+        return self.frames.features(histories)
+
+    @torch.no_grad()
+    def sample(
+        self, features: Float[Tensor, "B F"], noise: Float[Tensor, "B H A"], push: Push | None = None
+    ) -> Float[Tensor, "B H A"]:
+        condition = self.denoiser.condition(features)
+        return ddim_sample(self.denoiser.run, condition, noise, self.network.config.ddim_steps, push)
+
+    def plan(self, histories: Sequence[History], noise: Float[Tensor, "B H A"]) -> tuple[Tensor, Tensor]:
+        features = self.encode(histories)
+        return features, self.sample(features, noise)
+
+    def adapted(self, network: DiffusionPolicy, version: str) -> StepwiseEngine:
+        return StepwiseEngine(self.name, network, version, self.frames, self._make_denoiser)
