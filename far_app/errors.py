@@ -21,6 +21,10 @@ class RobotError(FarError):
     """The robot did not answer, refused a request, or reports an error of its own."""
 
 
+class ArmTaken(RobotError):
+    """Another program leads this arm."""
+
+
 class GraphicsError(FarError):
     """No GL back end can render the twin's cameras."""
 

@@ -17,10 +17,10 @@ from dataclasses import replace
 import zmq
 
 from far_app.endpoints import Call, Endpoints, Reply
-from far_app.errors import RobotError
+from far_app.errors import ArmTaken, RobotError
 from far_app.protocols import Guide, Heartbeat, Hold, Request, Reset, Resume
 from far_app.scheduling import prompt_context
-from far_app.station import LIMIT, ClockThread, RobotClock
+from far_app.station import LIMIT, ClockThread, RobotClock, myself, spoken
 from far_app.types import Ack, Observation, Target
 from far_app.wire import WireError, pack, unpack
 
@@ -53,9 +53,10 @@ class RemoteRobot:
         endpoints.secure(self._context)
         self.endpoints = endpoints
         self.clock = RobotClock()
+        self._who = myself()
         self._clock_thread: ClockThread | None = None
-        self._targets = self._dealer(send_limit=16)
-        self._requests = self._dealer(send_limit=16)
+        self._targets = self._dealer("targets", send_limit=16)
+        self._requests = self._dealer("requests", send_limit=16)
         self._targets_lock, self._requests_lock = threading.Lock(), threading.Lock()
         self._news = threading.Condition()
         self._newest: Observation | None = None
@@ -73,8 +74,9 @@ class RemoteRobot:
         self._thread = threading.Thread(target=self._receive, name="observations", daemon=True)
         try:
             if endpoints.elsewhere:
-                self._clock_thread = ClockThread(self._context, endpoints.station, self.clock)
+                self._clock_thread = ClockThread(self._context, endpoints.station, self.clock, self._who)
                 self._compare_clocks(connect_timeout)
+                self._lead()
             self._thread.start()
             with self._news:
                 if not self._news.wait_for(lambda: self._newest is not None, connect_timeout):
@@ -95,6 +97,14 @@ class RemoteRobot:
             )
         self._check_clock()
 
+    def _lead(self) -> None:
+        """One app leads an arm: raise ArmTaken where another does (a hw server of our own serves nobody else)."""
+        if self._clock_thread is not None and (holder := self._clock_thread.holder) not in ("", self._who):
+            raise ArmTaken(
+                f"the hw server at {self.endpoints.station} serves {spoken(holder)}; end that run first: two would "
+                "fight over one arm"
+            )
+
     def _check_clock(self) -> None:
         """Targets expire by the hw server's clock: it must be known well enough."""
         bound = self.clock.bound()
@@ -105,8 +115,10 @@ class RemoteRobot:
                 "of its own"
             )
 
-    def _dealer(self, send_limit: int) -> zmq.Socket[bytes]:
+    def _dealer(self, what: str, send_limit: int) -> zmq.Socket[bytes]:
         socket = self._context.socket(zmq.DEALER)
+        if self.endpoints.elsewhere:
+            socket.setsockopt(zmq.IDENTITY, f"{self._who} {what}".encode())
         socket.setsockopt(zmq.SNDHWM, send_limit)
         socket.setsockopt(zmq.LINGER, 0)
         socket.connect(self.endpoints.commands)
@@ -157,6 +169,7 @@ class RemoteRobot:
                     f"was cut off; the arm holds by its watchdog; {WHAT_TO_DO[self.endpoints.elsewhere]}"
                 )
             self._check_clock()
+            self._lead()
             acks, self._acks = tuple(self._acks), []
         newest = replace(newest, acks=acks)
         if reply is not None and newest.seq <= reply.seq:

@@ -2,10 +2,11 @@
 
 Real time (SCHED_FIFO) is for what runs a moment and must not wait its turn; the higher number goes first:
 
-    STOP 21 · servo 20 · messages between app and arm 15 · the app's loop 10
+    STOP 21 · servo 20 · messages between app and arm 15 · the app's loop 10 · the rest of a real arm's hw server 5
 
 The rest share the cores by niceness; a thread that runs Python beside one of the above holds its interpreter, and must
-itself not wait long for a core.
+itself not wait long for a core. In the hw server of a real arm STOP could be kept waiting that way: there all are real
+time (`real_time_from_here`).
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ STOP_PRIORITY = 21
 SERVO_PRIORITY = 20
 MESSAGE_PRIORITY = 15
 LOOP_PRIORITY = 10
+HARDWARE_PRIORITY = 5
 
 SERVO_NICENESS = -15
 PROMPT_NICENESS = -10
@@ -57,6 +59,12 @@ def real_time(priority: int, niceness: int = PROMPT_NICENESS) -> str:
     return "nice" if nice(niceness) else "normal"
 
 
+def real_time_from_here(priority: int) -> bool:
+    """Real time for the calling thread and for every thread it starts from now on, theirs too; False where not
+    permitted."""
+    return _schedule(priority, inherited=True)
+
+
 @contextlib.contextmanager
 def real_time_inside(priority: int, niceness: int = PROMPT_NICENESS) -> Iterator[str]:
     """The same for a while; what it began with is given back (its niceness only if real time was permitted)."""
@@ -76,7 +84,7 @@ def prompt_context() -> zmq.Context[zmq.Socket[bytes]]:
 
     def make() -> None:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
-        _schedule(MESSAGE_PRIORITY, inherited=True)
+        real_time_from_here(MESSAGE_PRIORITY)
         context.socket(zmq.PAIR).close()  # the first socket starts the context's thread, which inherits the priority
         made.append(context)
 

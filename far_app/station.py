@@ -12,6 +12,10 @@ nowhere else.
 from __future__ import annotations
 
 import contextlib
+import getpass
+import os
+import secrets
+import socket
 import threading
 import time
 from collections import deque
@@ -44,6 +48,10 @@ _M = TypeVar("_M")
 class ClockQuery:
     sent: float
     """Monotonic seconds of who asks."""
+    who: str = ""
+    """An app that leads the arm or wants to (`myself`); nobody else."""
+    leaving: bool = False
+    """It leads no longer."""
 
 
 @register
@@ -54,6 +62,8 @@ class ClockAnswer:
     received: float
     """Monotonic seconds of the hw server."""
     answered: float
+    holder: str = ""
+    """Who leads the arm; empty when nobody does."""
 
 
 @register
@@ -70,6 +80,18 @@ class Station:
     rig: Mapping[str, Any]
     """Its RigConfig as a dict."""
     task: str
+    holder: str = ""
+    """Which app leads its arm; empty when none does."""
+
+
+def myself() -> str:
+    """A name for this app that no other has: who and where, and after # what only tells it apart."""
+    return f"{getpass.getuser()}@{socket.gethostname()[:64]}, process {os.getpid()}#{secrets.token_hex(8)}"
+
+
+def spoken(who: str) -> str:
+    """The part of such a name that a person reads."""
+    return who.partition("#")[0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,10 +165,12 @@ def shifted(message: Any, by: float) -> Any:
 
 
 class ClockThread:
-    """Keeps a RobotClock up until closed: some exchanges at once, then four a second."""
+    """Keeps a RobotClock up until closed: some exchanges at once, then four a second. Each asks to lead the arm."""
 
-    def __init__(self, context: zmq.Context[Any], endpoint: str, clock: RobotClock) -> None:
-        self._context, self._endpoint, self._clock = context, endpoint, clock
+    def __init__(self, context: zmq.Context[Any], endpoint: str, clock: RobotClock, who: str) -> None:
+        self._context, self._endpoint, self._clock, self._who = context, endpoint, clock, who
+        self.holder = ""
+        """Who leads the arm, by the last answer."""
         self._closing = threading.Event()
         self.known = threading.Event()
         """Set once the first exchanges are done."""
@@ -158,18 +182,21 @@ class ClockThread:
         self._thread.join(timeout=2.0)
 
     def _run(self) -> None:
-        socket = asking(self._context, self._endpoint)
+        line = asking(self._context, self._endpoint)
         while not self._closing.wait(EVERY if self.known.is_set() else FIRST_EVERY):
             with contextlib.suppress(zmq.Again):
-                socket.send(pack(ClockQuery(sent=time.monotonic())), zmq.NOBLOCK)
-            if socket.poll(int(1000 * EVERY)):
-                raw, heard = socket.recv(), time.monotonic()
+                line.send(pack(ClockQuery(sent=time.monotonic(), who=self._who)), zmq.NOBLOCK)
+            if line.poll(int(1000 * EVERY)):
+                raw, heard = line.recv(), time.monotonic()
                 answer = unpack(raw)
                 if isinstance(answer, ClockAnswer):
                     self._clock.exchanged(answer, heard)
+                    self.holder = answer.holder
                 if self._clock.exchanges >= FIRST:
                     self.known.set()
-        socket.close()
+        with contextlib.suppress(zmq.Again):
+            line.send(pack(ClockQuery(sent=time.monotonic(), who=self._who, leaving=True)), zmq.NOBLOCK)
+        line.close(linger=200)
 
 
 def asking(context: zmq.Context[Any], endpoint: str) -> zmq.Socket[bytes]:

@@ -13,7 +13,7 @@ from far_app.marks import Judged
 from far_app.session_states import Intent, State
 from far_app.take_over import Steering
 from far_app.trial_plan.shown import PlanShown, SceneShown
-from far_app.types import AdaptationStep, Pose, RobotStatus
+from far_app.types import TICK_STAGES, AdaptationStep, Pose, RobotStatus
 from far_app.wire import register
 
 HIDDEN = "hidden"
@@ -39,6 +39,8 @@ class LoopHealth:
     """Ticks with no plan left."""
     plan_age_ticks: float = 0.0
     """Age of the newest chunk, ticks (recent median)."""
+    stages: Float[np.ndarray, "T S"] = field(default_factory=lambda: np.zeros((0, len(TICK_STAGES)), np.float32))
+    """Milliseconds that each of the last ten seconds' ticks spent on each of TICK_STAGES, newest last."""
 
 
 @register
@@ -206,6 +208,25 @@ class GeometryRequest:
 
 @register
 @dataclass(frozen=True, kw_only=True)
+class CameraHealth:
+    """Of one camera, since the hw server's start."""
+
+    frames: int = 0
+    """New pictures."""
+    dropped: int = 0
+    """Missing between two that came."""
+    stale: int = 0
+    """Too old when they came."""
+    frozen: int = 0
+    """The picture before once more."""
+    reopened: int = 0
+    """Times it was lost and came back."""
+    age: float = 0.0
+    """Of the newest new picture, seconds."""
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
 class View:
     """From the hw server to the page, at 15 Hz: operator-size pictures and where every body is."""
 
@@ -217,3 +238,5 @@ class View:
     body_poses: Float[np.ndarray, "B 7"]
     """Position and xyzw quaternion by body, metres, base frame."""
     status: RobotStatus
+    cameras: Mapping[str, CameraHealth] = field(default_factory=dict)
+    """By view name; empty for pictures that are drawn."""

@@ -94,6 +94,8 @@ class Ack:
     clipped: bool = False
     refused: str = ""
     """Why nothing was sent; empty when the target was taken."""
+    filter_seconds: float = float("nan")
+    """What the safety filter took in the hw server; NaN where nobody measures it (lockstep)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,6 +172,35 @@ class Step:
     """Seconds from the deadline to the target's acceptance in the hw server."""
     intervention: bool = False
     """A person moved the arm: `action` is theirs."""
+
+
+TICK_STAGES = ("observe", "infer", "aggregate", "filter", "send", "record", "publish")
+"""What a tick's time goes into, as TickTimes tells it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TickTimes:
+    """What one tick of the real-time loop spent on each stage, seconds. `infer` and `filter` run beside the loop's own
+    thread; the others are its, one after the other, and may wait for the interpreter."""
+
+    tick: int
+    """The policy's tick; at reduced speed several of the loop's share one."""
+    stamp: float
+    """The tick's deadline, monotonic seconds."""
+    observe: float
+    """Newest observation fetched; the operator, faults and freshness attended to."""
+    infer: float
+    """Chunks that became ready during this tick, in the planner's thread; 0 when none did."""
+    aggregate: float
+    """Success judged, chunks taken over and averaged, perturbation, target."""
+    filter: float
+    """The safety filter on this tick's target, in the hw server; 0 when its acknowledgment came too late or never."""
+    send: float
+    """The target put on its way."""
+    record: float
+    """The last step handed to the page's board and to the recorder's thread."""
+    publish: float
+    """The snapshot for the page, where one was due."""
 
 
 class Judge(StrEnum):

@@ -14,10 +14,11 @@ import logging
 import threading
 import time
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from far_app.errors import FarError, RobotError
 from far_app.scheduling import PROMPT_NICENESS, nice
+from far_app.telemetry import CameraHealth
 from hw.camera_config import CameraConfig
 from hw.capture import Capture, Shot
 
@@ -31,24 +32,6 @@ FIRST_WAIT, LONGEST_WAIT = 0.25, 2.0
 """Seconds between attempts to open a camera again; doubled each time."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameCounts:
-    """Since the reader's start."""
-
-    frames: int = 0
-    """New pictures."""
-    dropped: int = 0
-    stale: int = 0
-    frozen: int = 0
-    reopened: int = 0
-
-    def words(self) -> str:
-        return (
-            f"{self.frames} frames, {self.dropped} dropped, {self.stale} stale, {self.frozen} frozen, reopened "
-            f"{self.reopened} times"
-        )
-
-
 class CameraReader:
     """Reads from its start until closed."""
 
@@ -57,7 +40,8 @@ class CameraReader:
         self._capture = capture
         self.newest: Shot
         """The newest new picture; there from `start` on."""
-        self.counts = FrameCounts()
+        self.counts = CameraHealth()
+        """Its `age` is for `health` to tell."""
         self._digest = 0
         self._gap_known = True
         """The frame before came right before: a gap between them is frames dropped."""
@@ -74,8 +58,12 @@ class CameraReader:
             self._capture.close()
             raise
         self._digest = digest(self.newest)
-        self.counts = FrameCounts(frames=1)
+        self.counts = CameraHealth(frames=1)
         self._thread.start()
+
+    def health(self, now: float) -> CameraHealth:
+        """For the page."""
+        return replace(self.counts, age=max(0.0, now - self.newest.stamp))
 
     def trouble(self, now: float) -> str:
         """Why the camera counts as lost; empty while it is well."""

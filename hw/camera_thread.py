@@ -176,5 +176,5 @@ class CameraThread:
             status = controller.status()
         return View(
             seq=self._views, stamp=moment.stamp, jpegs=dict(self._jpegs), body_poses=view.body_poses(moment.snapshot),
-            status=status,
+            status=status, cameras=view.health(time.monotonic()) if isinstance(view, HardwareView) else {},
         )  # fmt: skip

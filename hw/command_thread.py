@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import replace
 
 import zmq
 
@@ -19,6 +20,7 @@ from far_app.station import ClockAnswer, ClockQuery, Station
 from far_app.telemetry import GeometryRequest, SceneGeometry
 from far_app.types import RobotMode, Target
 from far_app.wire import WireError, pack, unpack
+from hw.lease import Lease
 from hw.picture_timing import PictureTiming
 from hw.publisher_thread import PublisherThread
 from hw.servo_thread import ServoThread
@@ -41,6 +43,7 @@ class CommandThread:
         self._servo, self._publisher, self._geometry = servo, publisher, geometry
         self._timing, self._station = timing, station
         self._context, self._endpoints = context, endpoints
+        self._lease = Lease()
         self._closing = False
         self._pending: list[tuple[Future[None], list[bytes]]] = []
         self.damaged = 0
@@ -60,6 +63,7 @@ class CommandThread:
     def _run(self) -> None:
         real_time(MESSAGE_PRIORITY)
         self._commands = self._context.socket(zmq.ROUTER)
+        self._commands.setsockopt(zmq.ROUTER_HANDOVER, 1)  # an app whose cable was cut comes back under its name
         geometry, station = self._context.socket(zmq.REP), self._context.socket(zmq.REP)
         at = self._endpoints
         poller = zmq.Poller()
@@ -86,7 +90,12 @@ class CommandThread:
         except WireError as error:
             return self._damaged(f"{error}", parts)
         now = time.monotonic()
-        if len(parts) == 2 and isinstance(message, Target):
+        refusal = self._lease.refusal(parts[0].decode(errors="replace").rpartition(" ")[0], now)
+        if refusal and not (isinstance(message, Call) and isinstance(message.request, Hold)):
+            if len(parts) == 3:
+                return self._damaged(refusal, parts)
+            self.damaged += 1
+        elif len(parts) == 2 and isinstance(message, Target):
             self._take(message, now)
         elif len(parts) == 2 and isinstance(message, Call) and isinstance(message.request, Heartbeat):
             if now <= message.expires:
@@ -168,8 +177,11 @@ class CommandThread:
         except WireError as error:
             log.warning("refused a question: %s", error)
             query = None
-        if isinstance(query, ClockQuery):
-            answer = ClockAnswer(sent=query.sent, received=received, answered=time.monotonic())
-            socket.send(pack(answer), zmq.NOBLOCK)
-        else:
-            socket.send(pack(self._station), zmq.NOBLOCK)
+        if not isinstance(query, ClockQuery):
+            socket.send(pack(replace(self._station, holder=self._lease.holder(received))), zmq.NOBLOCK)
+            return
+        if query.leaving:
+            self._lease.leave(query.who)
+        holder = self._lease.holder(received) if query.leaving else self._lease.ask(query.who, received)
+        answer = ClockAnswer(sent=query.sent, received=received, answered=time.monotonic(), holder=holder)
+        socket.send(pack(answer), zmq.NOBLOCK)

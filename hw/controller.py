@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -43,10 +44,14 @@ EPSILON = 1e-9
 
 
 class ArmController:
-    """Called by one thread at a time (stop excepted). Times in seconds on the clock of the targets."""
+    """Called by one thread at a time (stop excepted). Times in seconds on the clock of the targets; `stopwatch` (any
+    clock) measures what the filter takes and nothing else: without one (simulated time) nobody does."""
 
-    def __init__(self, rig: RigConfig, task: TaskConfig, servo_hz: int, measured: Measured) -> None:
-        self.rig, self.task = rig, task
+    def __init__(
+        self, rig: RigConfig, task: TaskConfig, servo_hz: int, measured: Measured,
+        stopwatch: Callable[[], float] = lambda: math.nan,
+    ) -> None:  # fmt: skip
+        self.rig, self.task, self._stopwatch = rig, task, stopwatch
         self.period = 1.0 / servo_hz
         self.ramp = max(1, round(servo_hz / task.rate))
         self.holds = self.clips = 0
@@ -84,7 +89,9 @@ class ArmController:
         state = self._state
         if self.mode is RobotMode.HOLD:
             state = self._at_rest()
+        began = self._stopwatch()
         verdict = safety_filter(state, target, self.rig.safety, now)
+        took = self._stopwatch() - began
         if verdict.refused:
             return self._refuse(target, now, verdict.refused)
         if self.mode is RobotMode.HOLD:
@@ -93,7 +100,7 @@ class ArmController:
         self._at_home, self._homing = False, None
         self._grip = float(np.clip(target.gripper, -1.0, 1.0))
         self.clips += verdict.clipped
-        return self._acknowledge(target, now, verdict.pose, self._grip, clipped=verdict.clipped)
+        return self._acknowledge(target, now, verdict.pose, self._grip, clipped=verdict.clipped, took=took)
 
     def request(self, request: Home | Hold | Resume | Heartbeat | Reset | Guide, now: float) -> None:
         """Change the mode, or raise RobotError saying why not. (Reset is the plant's owner's affair.)"""
@@ -310,10 +317,12 @@ class ArmController:
         return self._acknowledge(target, now, self._state.pose, self._grip, refused=reason)
 
     def _acknowledge(
-        self, target: Target, now: float, pose: Pose, gripper: float, clipped: bool = False, refused: str = ""
-    ) -> Ack:
+        self, target: Target, now: float, pose: Pose, gripper: float, clipped: bool = False, refused: str = "",
+        took: float = math.nan,
+    ) -> Ack:  # fmt: skip
         ack = Ack(
-            seq=target.seq, accepted=now, due=target.due, pose=pose, gripper=gripper, clipped=clipped, refused=refused
-        )
+            seq=target.seq, accepted=now, due=target.due, pose=pose, gripper=gripper, clipped=clipped, refused=refused,
+            filter_seconds=took,
+        )  # fmt: skip
         self._acks.append(ack)
         return ack

@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from far_app.errors import ConfigError, FarError
 from far_app.picture import Framing, seen
 from far_app.protocols import Frame
-from far_app.telemetry import SceneGeometry
+from far_app.telemetry import CameraHealth, SceneGeometry
 from hw.camera_config import CameraConfig
 from hw.camera_reader import CameraReader
 from hw.capture import Capture, Shot, capture_for
@@ -80,6 +80,10 @@ class HardwareView:
             self._cameras[name, size] = HardwareCamera(name, size, *self._views[name])
         return self._cameras[name, size]
 
+    def health(self, now: float) -> dict[str, CameraHealth]:
+        """Of every view: its camera's."""
+        return {view: reader.health(now) for view, (reader, _) in self._views.items()}
+
     def trouble(self, now: float) -> str:
         """Why a camera counts as lost; empty while all are well."""
         return next((words for reader in self.readers.values() if (words := reader.trouble(now))), "")
@@ -97,5 +101,8 @@ class HardwareView:
     def close(self) -> None:
         for name, reader in self.readers.items():
             reader.close()
-            log.info("camera %s: %s", name, reader.counts.words())
+            log.info(
+                "camera %s: %d frames, %d dropped, %d stale, %d frozen, reopened %d times", name, reader.counts.frames,
+                reader.counts.dropped, reader.counts.stale, reader.counts.frozen, reader.counts.reopened,
+            )  # fmt: skip
         self._bodies.close()

@@ -23,6 +23,17 @@ from hw.xarm7.settings import XArmSettings
 RIGS = Path(__file__).parent / "rigs"
 
 
+STILL_BY = 0.15
+"""Seconds after the last fresh target by which the commanded velocity is zero."""
+WATCHDOG = 0.1
+"""Seconds after the last fresh target at which the watchdog triggers at the latest."""
+MOST = {
+    "step_translation": 0.05, "step_rotation": 0.5, "speed": 1.0, "rotation_speed": math.pi, "acceleration": 50.0,
+    "rotation_acceleration": 200.0,
+}  # fmt: skip
+"""What no rig file of a real arm can ask for more of: metres, radians and seconds."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SafetyLimits:
     """What the safety filter enforces, base frame."""
@@ -52,8 +63,16 @@ class SafetyLimits:
     def __post_init__(self) -> None:
         if any(low >= high for low, high in zip(self.box_min, self.box_max, strict=True)):
             raise ConfigError(f"safety box_min {self.box_min} must lie below box_max {self.box_max} on every axis")
-        if not 0 < self.turn <= math.pi:
-            raise ConfigError(f"safety turn is {self.turn}, must be above 0 and at most π radians")
+        for name in MOST:
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"safety {name} is {getattr(self, name)}, must be a number above 0")
+        if self.turn > math.pi:
+            raise ConfigError(f"safety turn is {self.turn}, must be at most π radians")
+
+    @property
+    def braking(self) -> float:
+        """Seconds from full speed to rest."""
+        return max(self.speed / self.acceleration, self.rotation_speed / self.rotation_acceleration)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +88,11 @@ class HomePath:
     """Metres from the start pose that count as home."""
     tolerance_rotation: float = 0.05
     """Radians."""
+
+    def __post_init__(self) -> None:
+        for name in ("open_seconds", "speed", "rotation_speed", "tolerance_translation", "tolerance_rotation"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"home {name} is {getattr(self, name)}, must be above 0")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,14 +134,33 @@ class RigConfig:
     def __post_init__(self) -> None:
         if self.robot not in ("twin", "xarm"):
             raise ConfigError(f"rig {self.name} drives a robot of kind '{self.robot}'; choose one of: twin, xarm")
-        if self.robot == "xarm" and self.cameras is None:
+        if self.robot == "xarm":
+            self._check_real()
+
+    def _check_real(self) -> None:
+        """Rules that hold for a real arm whatever its rig file says."""
+        if self.cameras is None:
             raise ConfigError(f"rig {self.name} names no cameras; say cameras = [] where it has none")
-        reach = self.xarm.servo_step * 100.0
-        if self.robot == "xarm" and self.safety.speed > reach + 1e-9:
+        for name, most in MOST.items():
+            if getattr(self.safety, name) > most:
+                raise ConfigError(f"safety {name} is {getattr(self.safety, name)}, must be at most {most:g}")
+        if not 0.0 < self.watchdog <= WATCHDOG:
+            raise ConfigError(f"rig {self.name}: watchdog is {self.watchdog} s, must be above 0 and at most {WATCHDOG}")
+        if self.watchdog + self.safety.braking > STILL_BY + 1e-9:
             raise ConfigError(
-                f"rig {self.name}: safety.speed is {self.safety.speed} m/s, but a servo step of at most "
-                f"{self.xarm.servo_step * 1e3:g} mm at 100 Hz allows {reach:g} m/s; lower the one or raise the other"
+                f"rig {self.name}: without targets the arm would stand still only "
+                f"{1e3 * (self.watchdog + self.safety.braking):.0f} ms after the last (limit {1e3 * STILL_BY:.0f} ms: "
+                f"watchdog, then braking for speed / acceleration); lower safety.speed or safety.rotation_speed, or "
+                "raise the accelerations"
             )
+        ticks = (("speed", self.xarm.servo_step, "m"), ("rotation_speed", self.xarm.servo_turn, "rad"))
+        for name, per_tick, unit in ticks:
+            asked, allowed = getattr(self.safety, name), 100.0 * per_tick
+            if asked > allowed + 1e-9:
+                raise ConfigError(
+                    f"rig {self.name}: safety.{name} is {asked} {unit}/s, but servo ticks of at most {per_tick:g} "
+                    f"{unit} at 100 Hz allow {allowed:g} {unit}/s; lower the one or raise the other"
+                )
 
     def scale_for(self, task: TaskConfig) -> ActionScale:
         """What ±1 means in a tick of the task."""

@@ -15,6 +15,7 @@ it was started by a person. Ends by SIGTERM or SIGINT, and by itself when its pa
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import logging
 import os
@@ -33,11 +34,17 @@ import cv2
 import zmq
 
 from far_app.config import TaskConfig
-from far_app.endpoints import HARDWARE, Endpoints
-from far_app.errors import ConfigError, FarError, RobotError
-from far_app.keys import server_keys
+from far_app.endpoints import Endpoints
+from far_app.errors import FarError, RobotError
 from far_app.protocols import Hold
-from far_app.scheduling import PROMPT_NICENESS, SWITCH_INTERVAL, nice, prompt_context
+from far_app.scheduling import (
+    HARDWARE_PRIORITY,
+    PROMPT_NICENESS,
+    SWITCH_INTERVAL,
+    nice,
+    prompt_context,
+    real_time_from_here,
+)
 from far_app.station import Station
 from far_app.tasks import task as task_named
 from hw.camera_config import with_views
@@ -46,7 +53,9 @@ from hw.command_thread import CommandThread
 from hw.controller import ArmController
 from hw.hardware_view import HardwareView
 from hw.input_device.reader import InputReader
+from hw.lease import claim
 from hw.picture_timing import PictureTiming
+from hw.places import in_folder, to_machines
 from hw.plant import Plant, PlantView
 from hw.publisher_thread import PublisherThread
 from hw.rig import RigConfig, at_address, load_rig
@@ -57,8 +66,6 @@ log = logging.getLogger(__name__)
 
 LOOK = 0.1
 """Seconds between looks at the parent and the threads."""
-SOCKET_NAME = 107
-"""Bytes the operating system allows in a socket's name."""
 BRAKING = 0.3
 """Seconds given to the arm to stand still before the process goes."""
 
@@ -69,6 +76,7 @@ def make_plant(rig: RigConfig, task: TaskConfig) -> tuple[Plant, Callable[[], Pl
         from hw.xarm7.blind import BlindView
         from hw.xarm7.plant import XArmPlant
 
+        claim(rig.xarm.address, rig.xarm.port)
         return XArmPlant(rig, task), BlindView
     from hw.twin import TwinPlant
     from hw.twin_view import TwinView
@@ -87,7 +95,7 @@ class Server:
         self.plant, make_bodies = make_plant(rig, task)
         cameras = rig.cameras
         make_view = (lambda: HardwareView(make_bodies(), cameras)) if cameras else make_bodies
-        controller = ArmController(rig, task, self.plant.servo_hz, self.plant.measure())
+        controller = ArmController(rig, task, self.plant.servo_hz, self.plant.measure(), time.perf_counter)
         self.servo = ServoThread(self.plant, controller, camera_rate=task.rate)
         self.device = InputReader(rig.input_device) if rig.input_device.kind else None
         self.publisher = PublisherThread(
@@ -157,33 +165,6 @@ class Ending:
         self._told.set()
 
 
-def in_folder(folder: Path) -> Endpoints:
-    """Endpoints for an app on this machine; the folder is made. Raises ConfigError."""
-    longest = len(str(folder / "observations").encode())
-    if longest > SOCKET_NAME:
-        raise ConfigError(
-            f"sockets below {folder} need names of {longest} bytes, at most {SOCKET_NAME} fit; choose a shorter folder"
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    return Endpoints.in_folder(folder)
-
-
-def to_machines(address: str, keys: Path | None) -> Endpoints:
-    """Endpoints for an app on another machine. Raises ConfigError, also where a port is taken."""
-    endpoints = Endpoints.at(address, server_keys(keys) if keys is not None else None)
-    with zmq.Context() as context, context.socket(zmq.PAIR) as socket:
-        for name in HARDWARE:
-            endpoint = getattr(endpoints, name)
-            try:
-                socket.bind(endpoint)
-            except zmq.ZMQError as error:
-                raise ConfigError(
-                    f"cannot serve {name} at {endpoint}: {error}; {len(HARDWARE)} ports from {address} on must be "
-                    "free, and the address one of this machine's: is another hw server running?"
-                ) from error
-    return endpoints
-
-
 def serve(
     endpoints: Endpoints, rig_name: str, task_name: str, parent: int | None, say: Callable[[dict[str, object]], None],
     controller: str = "",
@@ -192,9 +173,12 @@ def serve(
     began = time.monotonic()
     try:
         rig = at_address(load_rig(rig_name, task_name), controller)
+        if rig.robot == "xarm":
+            real_time_from_here(HARDWARE_PRIORITY)  # no thread may wait for a core while it holds STOP's interpreter
         task = with_views(task_named(task_name, rig.arm), rig.cameras)
         server = Server(rig, task, endpoints)
         server.start()
+        freeze()
     except zmq.ZMQError as error:
         raise RobotError(f"cannot serve at {endpoints.commands}: {error}; choose another place") from error
     ending = Ending(parent)
@@ -205,6 +189,13 @@ def serve(
     why = ending.wait()
     log.info("ending: %s", why)
     server.close(why)
+
+
+def freeze() -> None:
+    """What is loaded by now is out of the collector's sight: a full collection, ten milliseconds with the interpreter
+    held, would make STOP wait; of what comes later there is little."""
+    gc.collect()
+    gc.freeze()
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -2,7 +2,8 @@
 
 The number lies in every eye, in the middle of the picture, large enough to be read after cropping and shrinking
 (`number_in`). Used by tests, and by rigs with `device = "synthetic"`, or with trouble at set times,
-`device = "synthetic:unplugged@5+3,frozen@12+2"`: unplugged five seconds after the first frame for three seconds, …
+`device = "synthetic:unplugged@5+3,frozen@12+2"`: unplugged five seconds after the first frame for three seconds, …; or
+with the troubles that a file holds at the time, `device = "synthetic:/tmp/trouble"` and `echo frozen > /tmp/trouble`.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
@@ -67,18 +69,23 @@ class SyntheticCapture:
         """Of the newest frame."""
         self.opened = 0
         self._open = False
-        self._plan = trouble_plan(config.device)
+        words = config.device.partition(":")[2]
+        self._told = Path(words) if words.startswith("/") else None
+        self._plan = trouble_plan(config.device) if self._told is None else []
         self._began: float | None = None
         self._due = 0.0
         self._last: Shot | None = None
 
     def _act_out(self) -> None:
-        """Set the switches that the plan names, as the time has it."""
-        if not self._plan:
+        """Set the switches that the plan names, as the time has it, or that the file names now."""
+        if self._told is not None:
+            now = set(self._told.read_text().split()) if self._told.exists() else set()
+        elif self._plan:
+            self._began = self._clock() if self._began is None else self._began
+            since = self._clock() - self._began
+            now = {kind for kind, start, seconds in self._plan if start <= since < start + seconds}
+        else:
             return
-        self._began = self._clock() if self._began is None else self._began
-        since = self._clock() - self._began
-        now = {kind for kind, start, seconds in self._plan if start <= since < start + seconds}
         self.unplugged, self.frozen, self.stuck = (kind in now for kind in TROUBLES[:3])
         self.delay = SLOW if "slow" in now else 0.0
 

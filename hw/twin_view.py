@@ -1,7 +1,8 @@
 """What the twin's cameras see: its own MuJoCo model with decimated visual meshes, drawn by one EGL context a thread.
 
 Software rendering is bound by vertices (119,000 faces, most of them the arm's) and by shadows, reflections and
-multisampling; without them and with each mesh thinned once at start, two 84 × 84 pictures cost 6 ms instead of 65.
+multisampling; without them and with each mesh thinned once (hw/thin_meshes.py), two 84 × 84 pictures cost 6 ms instead
+of 65.
 """
 
 from __future__ import annotations
@@ -21,11 +22,8 @@ from far_app.errors import GraphicsError
 from far_app.motion import quat_inverse, quat_multiply
 from far_app.telemetry import BodyMesh, SceneGeometry
 from far_app.types import Pose
-
-FACE_BUDGET = 400
-"""Faces kept of each visual mesh."""
-MUJOCO_S_OWN = ".msh"
-"""A format only MuJoCo reads (can, bread, milk): such meshes are small, and stay as they are."""
+from hw.solids import box, cylinder
+from hw.thin_meshes import FACE_BUDGET, thin_meshes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,29 +51,14 @@ def look_at(camera: CameraPlacement) -> Float[np.ndarray, "4"]:
     return quaternion
 
 
-def thin_meshes(spec: mujoco.MjSpec, budget: int = FACE_BUDGET) -> None:
-    """Replace every visual mesh by one of about `budget` faces (quadric decimation); textures of primitives stay."""
-    import fast_simplification
-    import trimesh
-
-    for mesh in spec.meshes:
-        if not mesh.file or mesh.file.endswith(MUJOCO_S_OWN):
-            continue
-        shape: Any = trimesh.load(mesh.file, force="mesh", process=True)
-        shape.merge_vertices(merge_tex=True, merge_norm=True)
-        vertices: Any = np.asarray(shape.vertices, np.float32)
-        faces: Any = np.asarray(shape.faces, np.int32)
-        if len(faces) > budget:
-            vertices, faces, *_ = fast_simplification.simplify(vertices, faces, target_count=budget)
-        mesh.file = ""
-        mesh.uservert = np.asarray(vertices, float).ravel()
-        mesh.userface = np.asarray(faces, np.int32).ravel()
-
-
-def visual_model(xml: str, cameras: Mapping[str, CameraPlacement]) -> mujoco.MjModel:
-    """The scene for drawing only: thinned meshes, our cameras, no shadows, reflections or multisampling."""
+def visual_model(
+    xml: str, cameras: Mapping[str, CameraPlacement], budget: int | None = FACE_BUDGET
+) -> mujoco.MjModel:  # fmt: skip
+    """The scene for drawing only: thinned meshes, our cameras, no shadows, reflections or multisampling. Without a
+    budget the meshes stay whole: what the thinned ones are compared with."""
     spec = mujoco.MjSpec.from_string(xml)
-    thin_meshes(spec)
+    if budget is not None:
+        thin_meshes(spec, budget)
     for name, camera in cameras.items():
         body = spec.body(camera.body)
         body.add_camera(name=name, pos=camera.position, quat=look_at(camera), fovy=camera.fovy)
@@ -89,8 +72,11 @@ def visual_model(xml: str, cameras: Mapping[str, CameraPlacement]) -> mujoco.MjM
 class TwinView:
     """A PlantView (hw/plant.py) of TwinPlant's snapshots. Make and use it in one thread."""
 
-    def __init__(self, xml: str, base: Pose, cameras: Mapping[str, CameraPlacement]) -> None:
-        self._model = visual_model(xml, cameras)
+    def __init__(
+        self, xml: str, base: Pose, cameras: Mapping[str, CameraPlacement], budget: int | None = FACE_BUDGET
+    ) -> None:
+        """`budget`: faces kept of each mesh; None keeps all."""
+        self._model = visual_model(xml, cameras, budget)
         self._data = mujoco.MjData(self._model)
         self._base = base
         self._renderers: dict[int, mujoco.Renderer] = {}
@@ -99,6 +85,11 @@ class TwinView:
         self._options.geomgroup[:] = 0
         self._options.geomgroup[1] = 1
         self._options.sitegroup[:] = 0
+
+    @property
+    def faces(self) -> int:
+        """Triangles of all meshes."""
+        return int(self._model.nmeshface)
 
     def _renderer(self, size: int) -> mujoco.Renderer:
         if size not in self._renderers:
@@ -146,8 +137,6 @@ class TwinView:
 
     def _geom_mesh(self, geom: int) -> BodyMesh | None:
         """A visual geom as a triangle mesh in its body's frame; floor and walls are left out."""
-        import trimesh
-
         model = self._model
         kind, size = model.geom_type[geom], model.geom_size[geom]
         if model.geom_group[geom] != 1:
@@ -158,11 +147,9 @@ class TwinView:
             vertices = model.mesh_vert[v0 : v0 + model.mesh_vertnum[mesh]]
             faces = model.mesh_face[f0 : f0 + model.mesh_facenum[mesh]]
         elif kind == mujoco.mjtGeom.mjGEOM_BOX:
-            shape = trimesh.creation.box(extents=2 * size)
-            vertices, faces = shape.vertices, shape.faces
+            vertices, faces = box(size)
         elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-            shape = trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=24)
-            vertices, faces = shape.vertices, shape.faces
+            vertices, faces = cylinder(size[0], size[1])
         else:
             return None
         if model.geom_bodyid[geom] == 0:

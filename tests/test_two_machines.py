@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import getpass
 import json
 import math
 import os
@@ -23,7 +24,7 @@ from far_app.cli import main
 from far_app.cli.agreement import agreed
 from far_app.cli.options import RunOptions
 from far_app.endpoints import HARDWARE, Call, Endpoints
-from far_app.errors import ConfigError, RobotError
+from far_app.errors import ArmTaken, ConfigError, RobotError
 from far_app.keys import client_keys, make_keys, server_keys
 from far_app.link import RemoteRobot
 from far_app.motion import TargetIntegrator
@@ -251,6 +252,32 @@ def test_a_request_that_lay_in_a_cut_cable_does_not_act_but_a_hold_does(endpoint
         assert reply.status.mode is RobotMode.HOLD
         assert ("gave it up" in reply.error) is isinstance(request_, Home)
         socket.close()
+
+
+def test_one_app_leads_an_arm_and_a_second_is_told_who_does(endpoints: Endpoints):
+    me = f"{getpass.getuser()}@.*, process {os.getpid()};"
+    first = RemoteRobot(endpoints, connect_timeout=10.0)
+    with pytest.raises(ArmTaken, match=me):
+        RemoteRobot(endpoints, connect_timeout=10.0)
+    with pytest.raises(ArmTaken, match=me):
+        agreed(load_rig("xarm7"), "lift", station_at(endpoints))
+    with zmq.Context() as context:
+        endpoints.secure(context)
+        socket = context.socket(zmq.DEALER)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.connect(endpoints.commands)
+        for number, request in enumerate((Home(), Hold(reason="anybody may"))):
+            call = Call(request=request, expires=time.monotonic() + AHEAD + 5.0)
+            socket.send_multipart([str(number).encode(), pack(call)])
+            assert socket.poll(5000)
+            reply = unpack(socket.recv_multipart()[1])
+            assert ("led by" in reply.error) is isinstance(request, Home)
+        socket.close()
+    first.request(Home())
+    first.close()
+    second = RemoteRobot(endpoints, connect_timeout=10.0)
+    second.request(Hold(reason="it leads now"))
+    second.close()
 
 
 def test_a_station_says_what_it_drives(endpoints: Endpoints):

@@ -13,7 +13,7 @@ READERS = {
     ("time", "strftime"), ("datetime", "now"), ("datetime", "utcnow"), ("datetime", "today"), ("date", "today"),
     ("time", "CLOCK_REALTIME"),
 }  # fmt: skip
-METADATA = {"far_app/recording/session_folder.py", "far_app/recording/corrections.py"}
+METADATA = {"far_app/recording/session_folder.py", "far_app/recording/said_lines.py"}
 """The session's name and start, and the wall clock beside the monotonic one, once a session; when an operator's word
 was said."""
 MODULES = sorted(p for folder in ("far_app", "hw", "ui") for p in (ROOT / folder).rglob("*.py"))

@@ -31,15 +31,17 @@ from ui.scene3d import BRAND, FLAGGED, Scene3D
 from ui.scene_overlay import SceneOverlay
 from ui.stop import StopLine
 from ui.take_over import TakeOver
+from ui.tick_strip import tick_strip
 from ui.trials_panel import TrialsPanel
-from ui.view_model import Freshness, adaptation, arm_word, banner, control, loop_gauges, summary
+from ui.view_model import Freshness, adaptation, arm_word, banner, camera_note, control, loop_gauges, summary
 from ui.viewers import Live, Viewers
 
 PLACES = ("front", "wrist")
 """On the page, left to right, as style.css names them, whatever the views are called; more of them: the rerun page."""
 CONFIRM = 4.0
 """Seconds within which a second click ends the session."""
-_STYLE = (Path(__file__).parent / "style.css").read_text(encoding="utf-8")
+_HERE = Path(__file__).parent
+_STYLE = "\n".join((_HERE / sheet).read_text(encoding="utf-8") for sheet in ("style.css", "tick_strip.css"))
 _BLANK = np.full((8, 8, 3), 8, np.uint8)
 
 
@@ -100,6 +102,8 @@ class Console:
         self._beats = 0
         self._images: dict[str, viser.GuiImageHandle] = {}
         self._pictures: dict[str, bytes] = {}
+        self._captions: dict[str, tuple[viser.GuiHtmlHandle, str]] = {}
+        """Above each camera's picture, and its place's mark."""
         self._controls: dict[Intent, tuple[_Button, viser.GuiButtonHandle, viser.CommandHandle | None]] = {}
         server.gui.configure_theme(dark_mode=True, brand_color=BRAND, show_logo=False, show_share_button=False)
         server.gui.set_panel_label("FAR")
@@ -124,6 +128,7 @@ class Console:
         self._adapt = gui.add_html(html.adaptation(adaptation(None)))
         self._history = gui.add_html(html.history((), summary(())))
         self._events = gui.add_html(html.events((), 0.0))
+        self._strip = gui.add_html(tick_strip(None))
         self._add_cameras()
         self.plots = Plots(gui)
         self._panels = self._add_panels()
@@ -157,7 +162,7 @@ class Console:
 
     def _add_cameras(self) -> None:
         for camera, place in zip(self._cameras, PLACES, strict=False):
-            self._gui.add_html(html.caption(camera, "", f"mark-{place}"))
+            self._captions[camera] = (self._gui.add_html(html.caption(camera, "", f"mark-{place}")), f"mark-{place}")
             self._images[camera] = self._gui.add_image(_BLANK, format="jpeg")
 
     def _press_stop(self, source: str) -> None:
@@ -213,10 +218,14 @@ class Console:
         self._panels.show(telemetry)
         self._plan.show(telemetry)
         self._overlay.show(telemetry, view)
+        for camera, (handle, mark) in self._captions.items():
+            note, tone = camera_note(view.cameras.get(camera) if view is not None else None)
+            handle.content = html.caption(camera, note, mark, tone)
         self._adapt.content = html.adaptation(adaptation(telemetry))
         refusal = self.refusal if time.monotonic() - self._refused_at < 6 else ""
         gauges, session = loop_gauges(telemetry), telemetry.session if telemetry else ""
         if telemetry is not None:
+            self._strip.content = tick_strip(telemetry)
             self._history.content = html.history(telemetry.history, summary(telemetry.history))
             self._events.content = html.events(telemetry.log, telemetry.stamp)
             refusal = refusal or telemetry.refusal

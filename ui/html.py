@@ -128,9 +128,9 @@ def keys(page: Page, shown: bool) -> str:
     return f'<div class="far-keys{" on" if shown else ""}" id="op-keys">{body}</div>'
 
 
-def caption(title: str, note: str = "", mark: str = "") -> str:
+def caption(title: str, note: str = "", mark: str = "", tone: Tone = Tone.IDLE) -> str:
     """A title above a picture or a plot; `mark` names it for style.css."""
-    return f'<div class="far-caption {mark}"><b>{escape(title)}</b><em>{escape(note)}</em></div>'
+    return f'<div class="far-caption {mark} tone-{tone}"><b>{escape(title)}</b><em>{escape(note)}</em></div>'
 
 
 def value_caption(telemetry: Telemetry | None) -> str:

@@ -90,7 +90,7 @@ KEYS = (
     _console(UNSURE, "Y", "mark the chosen attempt: unsure how it went"),
     _console(EARLIER, ",", "marks: the attempt before"),
     _console(LATER, ".", "marks: the attempt after"),
-    _console(UNDO, "Z", "undo the adaptation: the next attempt starts from the weights before it"),
+    _console(UNDO, "Z", "undo the adaptation: the next attempt has the weights before it"),
     _console(HELP, "?", "show or hide this list", "shift"),
     _why(Press.NEXT, "N", "the next flagged chunk"),
     _why(Press.PREVIOUS, "B", "the flagged chunk before"),

@@ -47,7 +47,11 @@ class Panel(Protocol):
     title: str
     height: float
     """Page units."""
-    items: Sequence[Item]
+
+    @property
+    def items(self) -> Sequence[Item]:
+        """Its buttons."""
+        ...
 
     def html(self, telemetry: Telemetry | None) -> str:
         """Its words, above and between the buttons."""

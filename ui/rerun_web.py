@@ -83,12 +83,12 @@ class SealedViewer:
     """Serves the folder from a thread until closed."""
 
     def __init__(self, folder: Path, access: Access, port: int, data_port: int) -> None:
-        handler = partial(_Handler, directory=str(folder), access=access, data_port=data_port)
+        listener = access.listen(port)
+        port = int(listener.getsockname()[1])
+        handler = partial(_Handler, directory=str(folder), access=access, port=port, data_port=data_port)
         self._server = _Server((access.address, port), handler, bind_and_activate=False)
         self._server.socket.close()
-        self._server.socket = access.listen(port)
-        self._server.server_address = self._server.socket.getsockname()[:2]
-        port = int(self._server.server_address[1])
+        self._server.socket = listener
         base = f"http://{access.name}:{port}"
         data = quote(f"rerun+{base}/proxy", safe="")
         self.url = f"{base}/?{f'token={access.token}&' if access.token else ''}url={data}"
@@ -104,8 +104,8 @@ class _Server(http.server.ThreadingHTTPServer):
 
 
 class _Handler(http.server.SimpleHTTPRequestHandler):
-    def __init__(self, *arguments: Any, directory: str, access: Access, data_port: int) -> None:
-        self._access, self._data_port = access, data_port
+    def __init__(self, *arguments: Any, directory: str, access: Access, port: int, data_port: int) -> None:
+        self._access, self._port, self._data_port = access, port, data_port
         super().__init__(*arguments, directory=directory)
 
     def parse_request(self) -> bool:
@@ -113,7 +113,7 @@ class _Handler(http.server.SimpleHTTPRequestHandler):
         if not super().parse_request():
             return False
         headers = {name.title(): value for name, value in self.headers.items()}
-        said = self._access.answer(self.path, headers, int(self.server.server_address[1]))
+        said = self._access.answer(self.path, headers, self._port)
         if said is None:
             return True
         status, words, headers = said

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import zmq
 
 from far_app.endpoints import Endpoints
+from far_app.scheduling import STOP_PRIORITY, prompt_context, real_time
 from far_app.telemetry import StopAck, StopRequest
 from far_app.wire import WireError, pack, unpack
 
@@ -27,6 +28,8 @@ class StopResult:
     """None while under way."""
     latency_ms: float = float("nan")
     """From the press until the hw server's word that it latched was heard here."""
+    heard: float = float("nan")
+    """Monotonic seconds of the hw server at which it heard of it."""
     tries: int = 0
 
 
@@ -53,8 +56,8 @@ class StopLine:
         self._thread.join(timeout=1.0)
 
     def _serve(self) -> None:
-        hasten(threading.get_native_id())
-        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
+        real_time(STOP_PRIORITY)  # niceness would not do: it says nothing to the programs of another session
+        context = prompt_context()
         self._endpoints.secure(context)
         socket = self._connected(context)
         while True:
@@ -82,21 +85,24 @@ class StopLine:
         the socket for the next time."""
         request = pack(StopRequest(source=self._source, stamp=pressed))
         for attempt in range(1, TRIES + 1):
-            if self._ask(socket, request):
-                latency = 1000 * (time.monotonic() - pressed)
-                return socket, StopResult(pressed=pressed, latched=True, latency_ms=latency, tries=attempt)
+            if (answer := self._ask(socket, request)) is not None:
+                return socket, StopResult(
+                    pressed=pressed, latched=True, latency_ms=1000 * (time.monotonic() - pressed), heard=answer.latched,
+                    tries=attempt,
+                )  # fmt: skip
             socket.close()
             socket = self._connected(context)
             if self._closing:
                 break
         return socket, StopResult(pressed=pressed, latched=False, tries=TRIES)
 
-    def _ask(self, socket: zmq.Socket[bytes], request: bytes) -> bool:
+    def _ask(self, socket: zmq.Socket[bytes], request: bytes) -> StopAck | None:
         try:
             socket.send(request)
-            return isinstance(unpack(socket.recv()), StopAck)
+            answer = unpack(socket.recv())
         except (zmq.ZMQError, WireError):
-            return False
+            return None
+        return answer if isinstance(answer, StopAck) else None
 
 
 def hasten(thread: int) -> None:

@@ -9,7 +9,7 @@ from far_app.take_over import STEP, TURN, Move, Nudge
 from far_app.telemetry import Telemetry
 from ui.panels import BLUE, QUIET, Item
 
-_WIDTH, _HEIGHT, _TOP = 7.4, 4.1, 6.6
+_WIDTH, _HEIGHT, _TOP = 7.4, 4.1, 6.4
 _PAD: tuple[tuple[Move, str, int, int], ...] = (
     (Move.YAW_PLUS, "Turn left", 0, 0),
     (Move.FORWARD, "Forward", 1, 0),
@@ -23,8 +23,8 @@ _PAD: tuple[tuple[Move, str, int, int], ...] = (
     (Move.ROLL_MINUS, "Tilt −x", 1, 2),
     (Move.PITCH_PLUS, "Tilt +y", 2, 2),
     (Move.PITCH_MINUS, "Tilt −y", 3, 2),
-    (Move.OPEN, "Open hand", 0, 3),
-    (Move.CLOSE, "Close hand", 1, 3),
+    (Move.OPEN, "Open", 0, 3),
+    (Move.CLOSE, "Close", 1, 3),
 )
 """Move, label, column, row."""
 _MOTION = (Move.FORWARD, Move.BACK, Move.LEFT, Move.RIGHT, Move.UP, Move.DOWN)
@@ -52,8 +52,8 @@ class TakeOver:
 
     def html(self, telemetry: Telemetry | None) -> str:
         tone, line = said(telemetry)
-        steps = f"{1e3 * STEP:g} mm or {57.2958 * TURN:.1f}° a press, in the arm's base frame"
-        return f'<p class="far-line tone-{tone}">{escape(line)}</p><p class="far-line">{escape(steps)}</p>'
+        steps = f"{1e3 * STEP:g} mm or {57.2958 * TURN:.1f}° a press."
+        return f'<p class="far-line tone-{tone}">{escape(f"{line} {steps}")}</p>'
 
 
 def said(telemetry: Telemetry | None) -> tuple[str, str]:

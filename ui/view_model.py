@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from far_app.session_states import Intent, State
-from far_app.telemetry import HIDDEN, Telemetry, TrialRow
+from far_app.telemetry import HIDDEN, CameraHealth, Telemetry, TrialRow
 from far_app.types import RobotMode, RobotStatus
 
 SILENT_AFTER = 1.5
@@ -279,6 +279,22 @@ def loop_gauges(telemetry: Telemetry | None) -> tuple[Gauge, ...]:
         Gauge(label="max", value=f"{loop.late_max_ms:.1f} ms"),
         Gauge(label="plan age", value=f"{loop.plan_age_ticks:.1f} ticks"),
     )
+
+
+OLD_PICTURE = 0.25
+"""Seconds of a camera's newest picture from which its age is told; the arm is held by then."""
+
+
+def camera_note(health: CameraHealth | None) -> tuple[str, Tone]:
+    """What is wrong with a camera's pictures, now and so far; empty while all were well, and for drawn ones."""
+    if health is None:
+        return "", Tone.IDLE
+    reopened = f"back {health.reopened}×" if health.reopened else ""
+    counts = [f"{n} {word}" for word in ("dropped", "stale", "frozen") if (n := getattr(health, word))]
+    so_far = " · ".join(counts + [reopened] * bool(reopened))
+    if health.age > OLD_PICTURE:
+        return f"picture {health.age:.1f} s old" + (f" · {so_far}" if so_far else ""), Tone.WARN
+    return so_far, Tone.IDLE
 
 
 def arm_word(status: RobotStatus | None, person: bool = False) -> tuple[str, Tone]:

@@ -75,31 +75,49 @@ def measure(options: LoopOptions) -> dict[str, Any]:
         with stage(run) as stage_, client(stage_.page_url, options.seconds) as connected:
             half = options.seconds / 2
             with floor(stage_.task.rate) as woken:
-                idle, attempt, idle_span = naive_session(stage_, half)
+                idle_threads: dict[str, float] = {}
+                adapting_threads: dict[str, float] = {}
+                idle, attempt, idle_span = naive_session(stage_, half, idle_threads)
                 with learning_all_along(stage_.parts.method, attempt) as rounds:
-                    adapting, _, adapting_span = naive_session(stage_, half)
+                    adapting, _, adapting_span = naive_session(stage_, half, adapting_threads)
     return {
         "seconds": options.seconds,
         "page_client": connected,
-        "idle": _phase(idle) | {"floor": _floor(woken, idle_span)},
-        "adapting": _phase(adapting) | {"floor": _floor(woken, adapting_span), "adaptations": len(rounds)},
+        "idle": _phase(idle, idle_threads) | {"floor": _floor(woken, idle_span)},
+        "adapting": _phase(adapting, adapting_threads)
+        | {"floor": _floor(woken, adapting_span), "adaptations": len(rounds)},
         "floor": _floor(woken, (0.0, float("inf"))),
     }
 
 
-def naive_session(stage_: Stage, seconds: float) -> tuple[LoopStatistics, Attempt, tuple[float, float]]:
-    """Trials under naive retry for so long; returns the last failed attempt too, and when it was."""
+THREADS = ("recorder", "telemetry")
+"""Those that serve the loop and share its interpreter."""
+
+
+def naive_session(
+    stage_: Stage, seconds: float, threads: dict[str, float] | None = None
+) -> tuple[LoopStatistics, Attempt, tuple[float, float]]:
+    """Trials under naive retry for so long; returns the last failed attempt too, and when it was. `threads` is filled
+    with the processor seconds of each of THREADS."""
     began = time.monotonic()
-    statistics, failure = naive_trials(stage_, seconds)
+    statistics, failure = naive_trials(stage_, seconds, threads)
     if failure is None:
         raise FarError(f"no attempt failed within {seconds:g} s, so there is nothing to adapt from; measure for longer")
     return statistics, failure, (began, time.monotonic())
 
 
-def naive_trials(stage_: Stage, seconds: float) -> tuple[LoopStatistics, Attempt | None]:
+def naive_trials(
+    stage_: Stage, seconds: float, threads: dict[str, float] | None = None
+) -> tuple[LoopStatistics, Attempt | None]:
     """Trials under naive retry for so long; returns the last failed attempt, if one failed."""
     statistics, inbox = LoopStatistics(), IntentInbox()
-    timer = threading.Timer(seconds, inbox.put, (Intent.QUIT,))
+
+    def end() -> None:
+        if threads is not None:
+            threads.update(processor_seconds(THREADS))
+        inbox.put(Intent.QUIT)
+
+    timer = threading.Timer(seconds, end)
     timer.daemon = True
     with stage_.session(stage_.writer(), inbox, statistics, method=Unlearning(stage_.parts.method)) as session_:
         timer.start()
@@ -107,6 +125,15 @@ def naive_trials(stage_: Stage, seconds: float) -> tuple[LoopStatistics, Attempt
     if session_.recorder.error is not None:
         raise session_.recorder.error
     return statistics, session_.last_failure
+
+
+def processor_seconds(names: Sequence[str]) -> dict[str, float]:
+    """What the running threads of those names have used of a processor since they began."""
+    return {
+        t.name: time.clock_gettime(time.pthread_getcpuclockid(t.ident))
+        for t in threading.enumerate()
+        if t.name in names and t.ident is not None
+    }
 
 
 class Unlearning:
@@ -180,13 +207,18 @@ def client(page_url: str, seconds: float) -> Iterator[bool]:
         process.wait(10)
 
 
-def _phase(statistics: LoopStatistics) -> dict[str, Any]:
+def _phase(statistics: LoopStatistics, threads: dict[str, float]) -> dict[str, Any]:
+    """`threads_ms`: milliseconds of a processor for each tick of the loop."""
     ages = {"plan_age_ticks": (statistics.plan_age, 1.0), "obs_age_ms": (statistics.observation_age, 1e3)}
     wanted = ("p50", "p99")
-    return statistics.summary() | {
-        name: {k: v for k, v in percentiles(values, scale).items() if k in wanted}
-        for name, (values, scale) in ages.items()
-    }
+    return (
+        statistics.summary()
+        | {
+            name: {k: v for k, v in percentiles(values, scale).items() if k in wanted}
+            for name, (values, scale) in ages.items()
+        }
+        | {"threads_ms": {name: round(1e3 * s / max(1, statistics.timeline.ticks), 3) for name, s in threads.items()}}
+    )
 
 
 def _floor(woken: list[tuple[float, float]], span: tuple[float, float]) -> dict[str, Any]:

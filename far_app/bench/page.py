@@ -22,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from far_app.bench.loop import naive_trials
+from far_app.bench.loop import floor, naive_trials
 from far_app.bench.report import keep, write
 from far_app.bench.waiting import came_true
 from far_app.cli.options import RunOptions
@@ -73,27 +73,39 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def lateness(options: PageOptions) -> dict[str, Any]:
-    """p99 of each phase, of all phases of a kind together, and what the clients add."""
+    """p99 of each phase and of all phases of a kind together, for the loop and for a bare sleeper beside it: where the
+    sleeper's rises as well, it is the machine that was busy."""
     late: dict[str, list[float]] = {"without": [], "with": []}
+    spans: dict[str, list[tuple[float, float]]] = {"without": [], "with": []}
     rounds: list[dict[str, float | None]] = []
     with tempfile.TemporaryDirectory(prefix="far-bench-") as recordings:
         run = RunOptions(
             port=0, method="far", rerun=False, recordings=Path(recordings), retry=recommended(RunOptions.task, None)
         )
-        with stage(run) as stage_:
+        with stage(run) as stage_, floor(stage_.task.rate) as woken:
             for _ in range(options.rounds):
-                without = naive_trials(stage_, options.seconds)[0]
-                with clients(stage_.page_url, options.chromium):
-                    together = naive_trials(stage_, options.seconds)[0]
-                rounds.append({"without": _p99(without), "with": _p99(together)})
-                late["without"] += without.late
-                late["with"] += together.late
-    both = {kind: percentiles(values, 1e3) for kind, values in late.items()}
-    rises = [r["with"] - r["without"] for r in rounds if r["with"] is not None and r["without"] is not None]
+                of_round: dict[str, float | None] = {}
+                for kind in late:
+                    with clients(stage_.page_url, options.chromium) if kind == "with" else contextlib.nullcontext():
+                        began = time.monotonic()
+                        statistics = naive_trials(stage_, options.seconds)[0]
+                        spans[kind].append((began, time.monotonic()))
+                    of_round[kind] = _p99(statistics)
+                    late[kind] += statistics.late
+                rounds.append(of_round)
+    loop = {kind: percentiles(values, 1e3) for kind, values in late.items()}
+    bare = {
+        kind: percentiles([late for due, late in woken if any(a <= due <= b for a, b in spans[kind])], 1e3)
+        for kind in spans
+    }
     return {
-        "late_ms": both, "p99_ms_by_round": rounds, "p99_rise_ms": round(_of(both["with"]) - _of(both["without"]), 3),
-        "median_rise_ms": round(float(np.median(rises)), 3) if rises else None,
+        "late_ms": loop, "floor_ms": bare, "p99_ms_by_round": rounds,
+        "p99_rise_ms": _rise(loop), "floor_p99_rise_ms": _rise(bare),
     }  # fmt: skip
+
+
+def _rise(late: dict[str, dict[str, float | None]]) -> float:
+    return round(_of(late["with"]) - _of(late["without"]), 3)
 
 
 def _p99(statistics: LoopStatistics) -> float | None:

@@ -1,39 +1,41 @@
-"""Faults of the program itself while a real arm moves: processes killed or frozen, the disk full. Does the arm hold, is
-the recording readable, what does the operator read? Each time a whole `far run` of its own on the fake controller.
+"""Faults of the program itself while a real arm moves: processes killed or frozen, the disk full, the wall clock
+stepped. Each time a whole `far run` of its own on the fake controller, and its recording read afterwards.
 """
 
 from __future__ import annotations
 
-import contextlib
+import os
 import resource
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 
+from far_app.bench import wall_clock
+from far_app.bench.page_death import read_new_page, resume_there
+from far_app.bench.presser import Press, Presser
+from far_app.bench.recorded import attempts_in, lacking
 from far_app.bench.servo_trace import servo_trace
-from far_app.endpoints import Endpoints
+from far_app.bench.session_faults import PORT
 from far_app.errors import FarError
-from far_app.recording.inspect import inspect_session
-from far_app.session.statistics import percentiles
 from hw.fake_xarm.control import FakeXArm
 from hw.fake_xarm.protocol import Function
 from hw.rig import load_rig
 from ui.raw_client import RawClient
-from ui.stop import StopLine
 
-PORT = 15502
 START = 90.0
 """Seconds a run may take until the arm moves under the policy."""
 FULL = 4096
 """Bytes beyond which no file of a run with a full disk may grow."""
+HOUR, DAY = 3600.0, 86400.0
 
 
 @dataclass(kw_only=True)
@@ -42,11 +44,17 @@ class Struck:
 
     process: subprocess.Popen[str]
     fake: FakeXArm
+    clock: Path
+    """File with the seconds by which the run's wall clock is off."""
     url: str = ""
     """Of its page, where it has one."""
     page: RawClient | None = None
-    stop_s: float | None = None
-    """From STOP to its frame at the controller."""
+    press: Press | None = None
+    """Of STOP."""
+    resumed: bool | None = None
+    """Whether the operator led on in the same run; None where the run is over."""
+    first: float | None = None
+    """Millimetres from where the arm stood to the first target after that."""
     words: list[str] = field(default_factory=list)
 
     def child(self, module: str) -> psutil.Process:
@@ -70,115 +78,141 @@ class Blow:
     """For which it is watched."""
     page: bool = False
     """It needs a page that somebody looks at."""
+    holds: bool = True
+    """The arm is to hold; else the run is to go on."""
     ends: bool = False
     """The run ends by it, with a message."""
 
 
-def _freeze(run: Struck) -> None:
-    run.process.send_signal(signal.SIGSTOP)
-
-
 def _stop_frozen(run: Struck) -> None:
     """STOP as the page sends it, while the app is frozen."""
-    run.fake.received()
-    line = StopLine(Endpoints.in_folder(run.folder()))
-    time.sleep(0.2)
-    pressed = time.monotonic()
-    line.press("bench")
-    time.sleep(0.5)
-    frames = [r for r in run.fake.received() if r["function"] == Function.SET_STATE and r["argument"] == 4]
-    run.stop_s = frames[0]["at"] - pressed if frames else None
-    run.words.append("STOP: latched" if line.result is not None and line.result.latched else "STOP: NOT CONFIRMED")
-    line.close()
+    presser = Presser(run.folder())
+    run.process.send_signal(signal.SIGSTOP)
+    time.sleep(0.05)  # the watchdog has not held the arm yet
+    run.press = presser.press()
+    presser.close()
+    run.words.append("STOP: latched" if run.press.heard is not None else "STOP: NOT CONFIRMED")
 
 
-def _read_new_page(run: Struck) -> None:
-    """What the page says that was started in the dead one's place."""
-    deadline = time.monotonic() + 20.0
-    while time.monotonic() < deadline and not run.words:
-        with contextlib.suppress(OSError):
-            page = RawClient(run.url)
-            page.read(3.0)
-            run.words += [_reason(page)] * bool(_reason(page))
-            page.close()
-        time.sleep(0.2)
-
-
-def _reason(page: RawClient) -> str:
-    texts = " ".join(str(p.get("content", "")) for p in page.widgets.values())
-    start = texts.find("nobody has had the page open")
-    return texts[start : texts.find("<", start)] if start >= 0 else ""
+def _page_dies(run: Struck) -> None:
+    """The operator reads the page that is started in its place, and presses Resume there."""
+    page = read_new_page(run.url)
+    run.words += [page.words] if page is not None else []
+    run.first = resume_there(page, run.fake) if page is not None else None
+    run.resumed = run.first is not None
 
 
 def _fill_disk(run: Struck) -> None:
     resource.prlimit(run.process.pid, resource.RLIMIT_FSIZE, (FULL, FULL))
 
 
+def _step_clock(run: Struck) -> None:
+    """An hour ahead, then a day back."""
+    for off_by in (HOUR, -DAY):
+        run.clock.write_text(str(off_by))
+        time.sleep(0.5)
+
+
 WHOLE_RUNS: dict[str, Blow] = {
     "app SIGKILL": Blow(strike=lambda r: r.process.kill()),
     "hw server SIGKILL": Blow(strike=lambda r: r.child("hw.server").kill(), ends=True),
-    "page SIGKILL": Blow(strike=lambda r: r.child("ui.server").kill(), then=_read_new_page, seconds=4.0, page=True),
-    "app frozen, then STOP": Blow(strike=_freeze, then=_stop_frozen),
+    "page SIGKILL": Blow(strike=lambda r: r.child("ui.server").kill(), then=_page_dies, seconds=4.0, page=True),
+    "app frozen, then STOP": Blow(strike=_stop_frozen),
     "disk full": Blow(strike=_fill_disk, seconds=3.0, ends=True),
+    "wall clock stepped": Blow(strike=_step_clock, holds=False, seconds=1.0),
 }
 
 
-def whole_runs(name: str, repeats: int, address: str, policy: str) -> dict[str, Any]:
-    """The table's line."""
-    shots = [_once(WHOLE_RUNS[name], _next(address), policy) for _ in range(repeats)]
-    stops = [s["stop_s"] for s in shots if s["stop_s"] is not None]
-    return {
-        "times": len(shots),
-        "hold_ms": percentiles([s["hold_s"] for s in shots], 1e3),
-        "held": sum(s["held"] for s in shots),
-        "stop_frame_ms": percentiles(stops, 1e3) if stops else None,
-        "largest_step_mm": max(s["step_mm"] for s in shots),
-        "targets_outside_box": sum(s["outside"] for s in shots),
-        "recording_readable": sum(s["readable"] for s in shots),
-        "seconds_lost": percentiles([s["lost_s"] for s in shots]),
-        "operator_read": shots[-1]["words"],
-    }
-
-
-def _next(address: str) -> str:
-    head, _, last = address.rpartition(".")
-    return f"{head}.{int(last) + 1}"
-
-
-def _once(blow: Blow, address: str, policy: str) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory(prefix="far-bench-") as recordings:
-        run = _started(blow, address, policy, Path(recordings))
+def whole_run(blow: Blow, address: str, policy: str) -> dict[str, Any]:
+    """One run and its shot, as far_app/bench/session_faults.py has them."""
+    with tempfile.TemporaryDirectory(prefix="far-bench-") as folder:
+        recordings = Path(folder) / "recordings"
+        run = _started(blow, address, policy, Path(folder))
         try:
-            _wait_for_motion(run, Path(recordings))
-            struck, wall = time.monotonic(), time.time()
+            _wait_for_motion(run, recordings)
+            struck = time.monotonic()
             blow.strike(run)
+            struck = run.press.pressed if run.press is not None else struck
             time.sleep(blow.seconds)
-            trace = servo_trace(run.fake.servo_targets(), load_rig("xarm7").safety)
+            received = run.fake.received()
             blow.then(run)
             if blow.ends:
                 run.words += run.process.communicate(timeout=60)[1].strip().splitlines()
+            elif not blow.holds:
+                run.resumed = run.process.poll() is None
+            _end(run)
+            again = {} if run.resumed is not None else _start_again(run.fake)
         finally:
-            run.process.kill()
-            run.process.communicate()
+            _end(run)
             run.fake.close()
-        (folder,) = Path(recordings).iterdir()
-        steps = sum(a.steps for trial in inspect_session(folder).trials for a in trial.attempts)
-        newest = max(path.stat().st_mtime for path in folder.rglob("*") if path.is_file())
-    return {
-        "hold_s": max(0.0, trace.last_motion - struck), "held": trace.last_motion < struck + blow.seconds - 0.3,
-        "step_mm": trace.largest_step, "outside": trace.outside, "stop_s": run.stop_s,
-        "readable": steps > 0, "lost_s": max(0.0, wall - newest), "words": run.words[-1] if run.words else "",
-    }  # fmt: skip
+        lacks = lacking(attempts_in(recordings), struck)
+    trace = servo_trace(
+        [r for r in received if r["function"] == Function.MOVE_SERVO_CART_AA], load_rig("xarm7").safety
+    )  # fmt: skip
+    stops = [r["at"] for r in received if r["function"] == Function.SET_STATE and r["argument"] == 4]
+    held = trace.last_motion < struck + blow.seconds - 0.3
+    shot = {
+        "held": held, "hold_s": max(0.0, trace.last_motion - struck) if held else None,
+        "words": run.words[-1].replace(folder, "…") if run.words else "", "step_mm": trace.largest_step,
+        "outside": trace.outside,
+        "lacking_s": lacks, "resumed": bool(run.resumed), "first_mm": run.first,
+    } | again  # fmt: skip
+    if (press := run.press) is not None:
+        shot["stop_s"] = stops[0] - press.pressed if stops else None
+        shot["heard_s"] = stops[0] - press.heard if stops and press.heard is not None else None
+        shot["floor_s"] = press.floor
+    return shot
 
 
-def _started(blow: Blow, address: str, policy: str, recordings: Path) -> Struck:
-    fake = FakeXArm.start(address, PORT)
+def _end(run: Struck) -> None:
+    """With all its processes; its hw server holds the arm and goes by itself."""
+    if run.process.poll() is None:
+        run.process.kill()
+        run.process.communicate()
+    if run.page is not None:
+        run.page.close()
+        run.page = None
+
+
+def _start_again(fake: FakeXArm) -> dict[str, Any]:
+    """What a new hw server does first on the arm that the last one left: nothing is to move."""
+    deadline = time.monotonic() + 10.0
+    while fake.state()["connections"] > 0 and time.monotonic() < deadline:
+        time.sleep(0.1)  # the old one is on its way out
+    fake.received()
+    stood = np.array(fake.state()["position"])
+    command = [sys.executable, "-m", "hw.server", "--rig", "xarm7", "--parent", str(os.getpid())]
+    with tempfile.TemporaryDirectory(prefix="far-bench-") as folder:
+        process = subprocess.Popen(
+            [*command, "--folder", folder, "--address", f"{fake.address}:{PORT}"], stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL, text=True,
+        )  # fmt: skip
+        assert process.stdout is not None
+        ready = '"ready"' in process.stdout.readline()
+        time.sleep(0.3)
+        targets = fake.servo_targets()
+        process.terminate()
+        process.wait(timeout=10.0)
+    first = servo_trace(targets, load_rig("xarm7").safety).first
+    return {"resumed": ready, "first_mm": float(np.linalg.norm(first - stood)) if len(targets) else None}
+
+
+def stepped_clock(clock: Path) -> Mapping[str, str]:
+    """Of a run whose wall clock can be stepped."""
+    return os.environ | {"PYTHONPATH": str(Path(wall_clock.__path__[0])), "FAR_BENCH_CLOCK": str(clock)}
+
+
+def _started(blow: Blow, address: str, policy: str, folder: Path) -> Struck:
+    fake = FakeXArm.start(next_address(address), PORT)
+    clock = folder / "clock"
     command = [sys.executable, "-uc", "import sys; from far_app.cli import main; sys.exit(main(sys.argv[1:]))"]
-    command += ["run", "--robot", "xarm", "--host", f"{address}:{PORT}", "--no-rerun", "--full-speed"]
-    command += ["--policy", policy, "--recordings", str(recordings), "--max-attempts", "100"]
+    command += ["run", "--robot", "xarm", "--host", f"{fake.address}:{PORT}", "--no-rerun", "--full-speed"]
+    command += ["--policy", policy, "--recordings", str(folder / "recordings"), "--max-attempts", "100"]
     command += ["--port", "0"] if blow.page else ["--headless"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    run = Struck(process=process, fake=fake)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=stepped_clock(clock)
+    )
+    run = Struck(process=process, fake=fake, clock=clock)
     if blow.page:
         assert process.stdout is not None
         run.url = process.stdout.readline().split()[-1]
@@ -192,6 +226,11 @@ def _started(blow: Blow, address: str, policy: str, recordings: Path) -> Struck:
     return run
 
 
+def next_address(address: str) -> str:
+    head, _, last = address.rpartition(".")
+    return f"{head}.{int(last) + 1}"
+
+
 def _wait_for_motion(run: Struck, recordings: Path) -> None:
     """Until an attempt is recorded and the arm is led about."""
     deadline = time.monotonic() + START
@@ -203,4 +242,6 @@ def _wait_for_motion(run: Struck, recordings: Path) -> None:
             run.fake.received()
             return
         time.sleep(0.1)
-    raise FarError(f"the run did not come to move the arm within {START:g} s (exit status {run.process.poll()})")
+    run.process.kill()
+    said = run.process.communicate()[1].strip().splitlines()[-1:]
+    raise FarError(f"the run did not come to move the arm within {START:g} s; it said: {''.join(said)}")

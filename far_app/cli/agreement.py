@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from far_app.errors import ConfigError
-from far_app.station import Station
+from far_app.errors import ArmTaken, ConfigError
+from far_app.station import Station, spoken
 from hw.rig import RigConfig
 
 ITS_OWN = ("xarm.address", "xarm.port", "input_device.")
@@ -15,7 +15,12 @@ ITS_OWN = ("xarm.address", "xarm.port", "input_device.")
 
 
 def agreed(rig: RigConfig, task: str, station: Station) -> RigConfig:
-    """The rig with the arm's address as the other machine has it. Raises ConfigError where anything else differs."""
+    """The rig with the arm's address as the other machine has it. Raises ConfigError where anything else differs, and
+    ArmTaken where another app leads that arm."""
+    if station.holder:
+        raise ArmTaken(
+            f"the arm there is led by {spoken(station.holder)}; end that run first: two would fight over one arm"
+        )
     if station.task != task:
         raise ConfigError(
             f"the hw server there is set up for task {station.task}, this run is for {task}; say --task {task} there, "

@@ -39,8 +39,10 @@ def lines(session: SessionRecording, kept: Sequence[Kept]) -> list[str]:
             f"{k.pairs:>5} {change(k.winner_error):>15} {change(k.loser_error):>15}  {k.status:<8} "
             f"{retry(session, k):<8} {k.size / 1e6:>5.1f}"
         )
+    said = [f"{e.wall[:19]}  {e.text} ({e.detail.get('by') or 'the operator'})" for e in session.log
+            if e.event in ("policy_undone", "policy_restored", "policy_kept")]  # fmt: skip
     end = f"{len(kept)} versions, {size / 1e6:.1f} MB; far policy promote {session.path} VERSION --out FILE keeps one"
-    return [head, "", *table, "", end]
+    return [head, "", *table, "", *said, *[""] * bool(said), end]
 
 
 def change(error: tuple[float, float]) -> str:

@@ -29,7 +29,7 @@ from far_app.cli.processes import Child, Family, run_folder
 from far_app.config import TaskConfig
 from far_app.detectors import PersonJudge, TwinCheck
 from far_app.endpoints import Endpoints, note_elsewhere
-from far_app.errors import FarError, RobotError
+from far_app.errors import ArmTaken, FarError, RobotError
 from far_app.link import RemoteRobot
 from far_app.protocols import Method, PlanRequest, Policy, SuccessDetector
 from far_app.recording.schema import SessionInfo
@@ -166,15 +166,9 @@ Assembling = Callable[[RunOptions, TaskConfig], Mapping[str, Parts]]
 def one_method(options: RunOptions, task: TaskConfig) -> Mapping[str, Parts]:
     """What the options themselves ask for."""
     parts = assemble(
-        options.method,
-        task,
-        options.policy,
-        options.critic,
-        options.device,
-        options.retry,
-        options.engine,
+        options.method, task, options.policy, options.critic, options.device, options.retry, options.engine,
         threads=options.torch_threads,
-    )
+    )  # fmt: skip
     return {options.method: parts}
 
 
@@ -258,6 +252,8 @@ def connected(folder: Path, hardware: Child | None) -> Iterator[RemoteRobot]:
             hardware.check()
         try:
             robot = RemoteRobot(Endpoints.in_folder(folder), connect_timeout=1.0 if hardware is not None else 5.0)
+        except ArmTaken:
+            raise
         except RobotError as error:
             if time.monotonic() > deadline:
                 raise RobotError(

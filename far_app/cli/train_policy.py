@@ -51,7 +51,8 @@ def main(arguments: Sequence[str]) -> int:
     import torch
 
     from far_app.cli.assemble import check_device
-    from far_app.learning.dataset import read_episodes, read_setup
+    from far_app.learning.dataset import read_setup
+    from far_app.learning.decoded import decoded_episodes
     from far_app.learning.imagenet import resnet18_weights
     from far_app.learning.policy import preset
     from far_app.learning.train_policy import TRAININGS, train_policy
@@ -82,7 +83,7 @@ def main(arguments: Sequence[str]) -> int:
         rig = load_rig(options.rig, task.name)
         framings = views_of(rig.cameras or {})
         setup = setup_of(rig, with_views(find_task(task.name, rig.arm), rig.cameras)).table()
-    episodes = read_episodes(data, config.cameras, options.demonstrations, config.image_size, framings)
+    episodes = decoded_episodes(data, config.cameras, options.demonstrations, config.image_size, framings)
     folder = options.out or Path("runs") / f"{task.name}-{options.preset}"
     card: dict[str, object] = {"command": "far train policy " + " ".join(arguments)}
     if setup is not None:

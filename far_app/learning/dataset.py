@@ -78,6 +78,11 @@ def count_episodes(path: Path) -> int:
         return len(file["data"]) if "data" in file else 0
 
 
+def episode_count(path: Path, limit: int | None) -> int:
+    """How many of a file's demonstrations a limit leaves."""
+    return min(count_episodes(path), limit if limit is not None else count_episodes(path))
+
+
 def check_origin(path: Path, env_args: dict[str, object]) -> None:
     """ConfigError when a file holds episodes of another environment or another arm."""
     if not path.exists():
@@ -124,14 +129,15 @@ def read_episodes(
     limit: int | None = None,
     size: int | None = None,
     framings: Mapping[str, Framing] | None = None,
+    first: int = 0,
 ) -> list[Episode]:
-    """The first `limit` demonstrations, decoded, their pictures of `size` pixels; `framings`: how the cameras' whole
-    frames are cut, where that is what the file holds."""
+    """`limit` demonstrations from the `first` on, decoded, their pictures of `size` pixels; `framings`: how the whole
+    frames of the cameras are cut, where that is what the file holds."""
     if not path.exists():
         raise RecordingError(f"no demonstrations at {path}; make some with `far demo`")
     episodes = []
     with h5py.File(path, "r") as file:
-        names = sorted(file["data"], key=lambda name: int(name.removeprefix("demo_")))[:limit]
+        names = sorted(file["data"], key=lambda name: int(name.removeprefix("demo_")))[first:][:limit]
         for name in names:
             group = file["data"][name]
             missing = [c for c in cameras if f"{c}_image" not in group["obs"]]

@@ -1,7 +1,8 @@
 """Batches of consecutive ticks from demonstrations, and their features with every frame encoded once.
 
 Two histories that share a frame share its features, so a light encoder sees five frames for four histories instead of
-eight. Pictures are padded once and cropped anew for each segment: the random shift.
+eight. The random shift moves a segment's pictures by a few pixels; what comes in at an edge repeats that edge. Pictures
+stay where the episodes have them (a map of a file, perhaps): only those of a batch are touched.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class Segments:
 
 
 class DemonstrationArrays:
-    """All demonstrations in memory, pictures padded for random shifts, addressed by (episode, tick)."""
+    """All demonstrations, addressed by (episode, tick)."""
 
     def __init__(self, episodes: Sequence[Episode], config: PolicyConfig, shift: int) -> None:
         if not episodes:
@@ -42,10 +43,7 @@ class DemonstrationArrays:
         self.config, self.shift = config, shift
         self.lengths = np.array([len(e) for e in episodes])
         self.starts = np.concatenate([[0], np.cumsum(self.lengths)[:-1]])
-        pad = ((0, 0), (shift, shift), (shift, shift), (0, 0))
-        self.images = {
-            c: np.concatenate([np.pad(e.images[c], pad, mode="edge") for e in episodes]) for c in config.cameras
-        }
+        self.images = {c: [e.images[c] for e in episodes] for c in config.cameras}
         self.states = np.concatenate([states_of(e, config.objects) for e in episodes])
         self.actions = np.concatenate([e.actions for e in episodes])
         self.offsets = object_offsets(episodes)
@@ -62,7 +60,7 @@ class DemonstrationArrays:
         span = np.arange(-(n_obs - 1), length)
         frames = np.clip(start[:, None] + span, self.starts[first][:, None], self.ends[rows][:, None])
         offsets = rng.integers(0, 2 * self.shift + 1, (count, 2))
-        images = {c: torch.from_numpy(self._cropped(a, frames, offsets, size)) for c, a in self.images.items()}
+        images = {c: self._shifted(c, first, frames, offsets, size) for c in self.config.cameras}
         ticks = frames[:, n_obs - 1 :]
         index = np.minimum(ticks[..., None] + np.arange(horizon), self.ends[rows][:, None, None])
         located = None if self.offsets is None else torch.from_numpy(self.offsets[ticks])
@@ -71,12 +69,36 @@ class DemonstrationArrays:
             offsets=located, rows=ticks,
         )  # fmt: skip
 
-    @staticmethod
-    def _cropped(array: np.ndarray, frames: np.ndarray, offsets: np.ndarray, size: int) -> np.ndarray:
+    def _shifted(
+        self, camera: str, episode: np.ndarray, frames: np.ndarray, offsets: np.ndarray, size: int
+    ) -> UInt8[Tensor, "S F P P 3"]:
+        """Each segment's pictures moved by its offset, 0 … 2 · shift; the middle leaves them as they are."""
         out = np.empty((*frames.shape, size, size, 3), np.uint8)
-        for i, (dy, dx) in enumerate(offsets):
-            out[i] = array[frames[i], dy : dy + size, dx : dx + size]
-        return out
+        local = frames - self.starts[episode][:, None]
+        for i, (y, x) in enumerate(self._pixels(offsets, size)):
+            out[i] = self.images[camera][episode[i]][local[i]].take(y, axis=1).take(x, axis=2)
+        return torch.from_numpy(out)
+
+    def _pixels(self, offsets: Int[np.ndarray, "S 2"], size: int) -> Int[np.ndarray, "S 2 P"]:
+        """Which row and which column of a picture each of the moved one's is."""
+        return np.clip(offsets[:, :, None] + np.arange(size) - self.shift, 0, size - 1)
+
+
+class DeviceDemonstrations(DemonstrationArrays):
+    """The same batches with all pictures on a GPU: a batch is gathered there, and nothing but indices travels."""
+
+    def __init__(self, episodes: Sequence[Episode], config: PolicyConfig, shift: int, device: str) -> None:
+        super().__init__(episodes, config, shift)
+        self._all = {c: torch.cat([torch.tensor(a, device=device) for a in v]) for c, v in self.images.items()}
+        self.images = {}
+
+    def _shifted(
+        self, camera: str, episode: np.ndarray, frames: np.ndarray, offsets: np.ndarray, size: int
+    ) -> UInt8[Tensor, "S F P P 3"]:
+        pictures = self._all[camera]
+        pixels = torch.from_numpy(self._pixels(offsets, size)).to(pictures.device, non_blocking=True)
+        rows = torch.from_numpy(frames).to(pictures.device, non_blocking=True)
+        return pictures[rows[:, :, None, None], pixels[:, None, 0, :, None], pixels[:, None, 1, None, :]]
 
 
 def object_offsets(episodes: Sequence[Episode]) -> np.ndarray | None:
@@ -87,6 +109,17 @@ def object_offsets(episodes: Sequence[Episode]) -> np.ndarray | None:
         e.objects.reshape(len(e), -1, 7)[:, :, :3] - e.states[:, None, :3] for e in episodes if e.objects is not None
     ]
     return (np.concatenate(parts).reshape(sum(map(len, parts)), -1) * 10.0).astype(np.float32)
+
+
+def history_features(policy: DiffusionPolicy, images: dict[str, Tensor], states: Tensor) -> Tensor:
+    """Features of every history in a batch of segments, (count · length, F), each history encoded for itself."""
+    n_obs = policy.config.n_obs
+    length = states.shape[1] - n_obs + 1
+
+    def histories(x: Tensor) -> Tensor:
+        return torch.stack([x[:, t : t + length] for t in range(n_obs)], dim=2).flatten(0, 1)
+
+    return policy.features({c: histories(x) for c, x in images.items()}, histories(states))
 
 
 def segment_features(policy: DiffusionPolicy, images: dict[str, Tensor], states: Tensor) -> Tensor:

@@ -25,11 +25,10 @@ from tqdm import tqdm
 
 from far_app.errors import ConfigError, PolicyError
 from far_app.learning.dataset import Episode
-from far_app.learning.diffusion import TRAIN_STEPS, add_noise
 from far_app.learning.policy import DiffusionPolicy, PolicyConfig, save_policy
+from far_app.learning.policy_step import FastStep, PlainStep
 from far_app.learning.resume import load_state, optimizer_tensors, restore_optimizer, save_state
-from far_app.learning.segments import DemonstrationArrays, segment_features
-from far_app.learning.trainable import Trainable, trainable
+from far_app.learning.segments import DemonstrationArrays, DeviceDemonstrations
 
 log = logging.getLogger(__name__)
 
@@ -72,32 +71,6 @@ TRAININGS = {
 }
 
 
-def denoising_loss(
-    denoiser: Trainable,
-    features: Tensor,
-    chunks: Tensor,
-    generator: torch.Generator,
-    draws: int,
-    weights: Float[Tensor, "B"] | None = None,
-) -> Tensor:
-    """E w ‖ε − ε_θ(a_k, s, k)‖², averaged over entries; w is 1 without weights."""
-    chunks, condition = chunks.repeat(draws, 1, 1), denoiser.condition(features).repeat(draws, 1)
-    k = torch.randint(0, TRAIN_STEPS, (len(chunks),), generator=generator).to(chunks.device)
-    noise = torch.randn(chunks.shape, generator=generator).to(chunks.device)
-    squared = (denoiser.run(add_noise(chunks, noise, k), k, condition) - noise).square()
-    return squared.mean() if weights is None else (squared.mean(dim=(1, 2)) * weights.repeat(draws)).mean()
-
-
-def backward(loss: Tensor, denoiser: Trainable) -> None:
-    """Gradients of the loss on the encoder's and the denoiser's own weights."""
-    loss.backward()
-    flat = denoiser.pull_back([torch.zeros_like(m) if m.grad is None else m.grad for m in denoiser.leaves])
-    for parameter, gradient in zip(
-        denoiser.parameters, flat.split([p.numel() for p in denoiser.parameters]), strict=True
-    ):
-        parameter.grad = gradient.view_as(parameter)
-
-
 def learning_rate(config: PolicyTraining, iteration: int) -> float:
     """Linear warm-up, then cosine from lr to lr_end."""
     if iteration < config.warmup:
@@ -116,31 +89,24 @@ def train_policy(
     imagenet: dict[str, Tensor] | None = None,
     start: DiffusionPolicy | None = None,
     weights: Float[np.ndarray, "N"] | None = None,
+    plain: bool = False,
 ) -> Path:
     """Train (or go on training) in a folder; returns the checkpoint (EMA weights). log.jsonl: a line an interval.
 
     `start`: finetune this policy, its encoder and normaliser frozen, so that a critic on its features keeps its
-    meaning. `weights`: of every tick of the episodes, side by side (paper, Eq. awr)."""
+    meaning. `weights`: of every tick of the episodes, side by side (paper, Eq. awr).
+    `plain`: by the readable form of a step (policy_step)."""
     torch.manual_seed(training.seed)
     rng = np.random.default_rng(training.seed)
     generator = torch.Generator().manual_seed(training.seed)
-    policy = DiffusionPolicy(config)
-    if imagenet is not None:
-        load_imagenet(policy, imagenet)
-    arrays = DemonstrationArrays(episodes, config, training.shift)
-    if start is None:
-        policy.normalizer.fit(arrays.states)
-    else:
-        policy.load_state_dict(start.state_dict())
-        policy.encoder.requires_grad_(False)
-    policy.to(device)
-    ema = copy.deepcopy(policy).requires_grad_(False)
-    locator = None
-    if training.localise > 0 and arrays.offsets is not None:
-        locator = torch.nn.Linear(policy.feature_dim, arrays.offsets.shape[1]).to(device)
-    learnt = [*(p for p in policy.parameters() if p.requires_grad), *(locator.parameters() if locator else ())]
-    optimizer = torch.optim.AdamW(learnt, lr=training.lr, betas=(0.95, 0.999), weight_decay=training.weight_decay)
-    denoiser = trainable(policy.denoiser, config.horizon)
+    on_cpu = torch.device(device).type == "cpu"
+    arrays = (
+        DemonstrationArrays(episodes, config, training.shift)
+        if on_cpu or plain
+        else DeviceDemonstrations(episodes, config, training.shift, device)
+    )
+    step = begun(PlainStep if plain else FastStep, config, training, arrays, device, imagenet, start)
+    policy, ema, locator, optimizer = step.policy, step.ema, step.locator, step.optimizer
     state_path = folder / "state.safetensors"
     done = 0
     if state_path.exists():
@@ -172,32 +138,15 @@ def train_policy(
     bar = tqdm(range(done, training.iterations), initial=done, total=training.iterations, unit="it", desc="policy")
     for iteration in bar:
         lr = learning_rate(training, iteration)
-        for group in optimizer.param_groups:
-            group["lr"] = lr
         drawn = arrays.segments(training.batch // training.segment, training.segment, rng)
-        images = {c: v.to(device, non_blocking=True) for c, v in drawn.images.items()}
-        features = segment_features(policy, images, drawn.states.to(device))
-        denoiser.refresh()
         weight = None if weights is None else torch.from_numpy(weights[drawn.rows.ravel()]).to(device)
-        chunks = drawn.chunks.flatten(0, 1).to(device)
-        loss = denoising_loss(denoiser, features, chunks, generator, training.draws, weight)
-        if locator is not None and drawn.offsets is not None:
-            located = (locator(features) - drawn.offsets.flatten(0, 1).to(device)).square().mean()
-            loss = loss + training.localise * located
+        loss = step.loss(drawn, generator, weight)
         if not torch.isfinite(loss):
             raise PolicyError(
                 f"the loss became {loss.item()} at iteration {iteration}; the last good state is {state_path}; "
                 "lower --lr and start again"
             )
-        optimizer.zero_grad(set_to_none=True)
-        backward(loss, denoiser)
-        optimizer.step()
-        decay = 1.0 - (1 + iteration) ** -training.ema_power
-        with torch.no_grad():
-            for slow, fast in zip(ema.parameters(), policy.parameters(), strict=True):
-                slow.lerp_(fast, 1.0 - decay)
-            for slow, fast in zip(ema.buffers(), policy.buffers(), strict=True):
-                slow.copy_(fast)
+        step.update(loss, lr, decay=1.0 - (1 + iteration) ** -training.ema_power)
         losses.append(loss.item())
         if (iteration + 1) % training.log_every == 0 or iteration + 1 == training.iterations:
             mean = float(np.mean(losses))
@@ -214,6 +163,30 @@ def train_policy(
         "ticks": int(arrays.lengths.sum()), "seconds": time.monotonic() - started,
     })  # fmt: skip
     return checkpoint
+
+
+def begun(
+    form: type[PlainStep], config: PolicyConfig, training: PolicyTraining, arrays: DemonstrationArrays,
+    device: str = "cpu", imagenet: dict[str, Tensor] | None = None, start: DiffusionPolicy | None = None,
+) -> PlainStep:  # fmt: skip
+    """A step on new weights (or on `start`'s, its encoder and normaliser frozen); torch's seed decides on them."""
+    policy = DiffusionPolicy(config)
+    if imagenet is not None:
+        load_imagenet(policy, imagenet)
+    if start is None:
+        policy.normalizer.fit(arrays.states)
+    else:
+        policy.load_state_dict(start.state_dict())
+        policy.encoder.requires_grad_(False)
+    policy.to(device)
+    ema = copy.deepcopy(policy).requires_grad_(False)
+    locator = None
+    if training.localise > 0 and arrays.offsets is not None:
+        locator = torch.nn.Linear(policy.feature_dim, arrays.offsets.shape[1]).to(device)
+    return form(
+        policy, ema, locator, lr=training.lr, weight_decay=training.weight_decay, draws=training.draws,
+        localise=training.localise,
+    )  # fmt: skip
 
 
 def load_imagenet(policy: DiffusionPolicy, weights: dict[str, Tensor]) -> None:

@@ -15,12 +15,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from far_app.recording.append_file import AppendFile, sync_folder
 from far_app.recording.codec import Json, codec
-from far_app.recording.images import encode_png
+from far_app.recording.images import stored_png
 from far_app.recording.schema import (
     CAMERA_TOPIC,
     SCHEMA_NAME,
@@ -31,7 +32,7 @@ from far_app.recording.schema import (
     RecordedEvent,
     json_schemas,
 )
-from far_app.types import ActionChunk, Adaptation, AdaptationStep, Observation, Outcome, Step
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, Observation, Outcome, Step, TickTimes
 
 _NEVER = 2**40
 """Bytes after which the library itself would cut a chunk; we cut one at each flush."""
@@ -70,6 +71,9 @@ class AttemptFile:
 
     def chunk(self, chunk: ActionChunk, stamp: float) -> None:
         self._write("/chunk", ActionChunk, chunk, stamp, chunk.tick)
+
+    def tick_times(self, times: TickTimes) -> None:
+        self._write("/tick_times", TickTimes, times, times.stamp, times.tick)
 
     def event(self, event: RecordedEvent) -> None:
         self._write("/event", RecordedEvent, event, event.stamp)
@@ -134,7 +138,7 @@ class AttemptFile:
         log_time = self._log_time(stamp)
         message = CompressedImage(
             timestamp=CompressedImageTime(sec=log_time // 10**9, nsec=log_time % 10**9), frame_id=camera,
-            data=base64.b64encode(encode_png(image)).decode("ascii"), format="png",
+            data=base64.b64encode(stored_png(image)).decode("ascii"), format="png",
         )  # fmt: skip
         self._camera_channel(camera)
         self._write(CAMERA_TOPIC + camera, CompressedImage, message, stamp, number)
@@ -153,7 +157,7 @@ class AttemptFile:
         self._write_json(topic, codec(record).encode(value), stamp, sequence)
 
     def _write_json(self, topic: str, lowered: Json, stamp: float, sequence: int = 0) -> None:
-        raw = json.dumps(lowered, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
+        raw = msgspec.json.encode(lowered)
         log_time = self._log_time(stamp)
         self._writer.add_message(self._channels[topic], log_time, raw, log_time, sequence)
 

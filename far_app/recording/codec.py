@@ -158,9 +158,10 @@ def _checked(value: Any, dims: int) -> np.ndarray:
 
 
 def _encode_numbers(array: np.ndarray) -> list[Json]:
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        return [encode_float(value) for value in array.tolist()]
-    return array.tolist()
+    numbers = array.tolist()
+    if array.dtype.kind == "f" and not math.isfinite(sum(numbers)):  # a sum over few numbers: quicker than numpy
+        return [encode_float(value) for value in numbers]
+    return numbers
 
 
 def _encode_matrix(value: Any) -> Json:

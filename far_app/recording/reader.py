@@ -45,6 +45,7 @@ from far_app.types import (
     Observation,
     Outcome,
     Step,
+    TickTimes,
 )
 
 
@@ -58,6 +59,8 @@ class AttemptRecording:
     steps: tuple[Step, ...]
     """In the order of their ticks; frames are decoded when asked for."""
     chunks: tuple[ActionChunk, ...]
+    tick_times: tuple[TickTimes, ...]
+    """Where each tick's time went; empty in older recordings."""
     events: tuple[RecordedEvent, ...]
     final: Observation | None
     outcomes: tuple[Outcome, ...]
@@ -200,14 +203,16 @@ class _Parts:
         outcomes = self._values("/outcome", Outcome)
         adaptations = self._values("/adaptation", Adaptation)
         chunks = self._values("/chunk", ActionChunk)
+        times = self._values("/tick_times", TickTimes)
         events = self._values("/event", RecordedEvent)
         progress = self._values("/adaptation_step", AdaptationStep)
         abandonments = [event.text for event in events if event.event in ("attempt_abandoned", "recording_failed")]
         self._say_what_is_missing(steps, finals, outcomes, abandoned=bool(abandonments))
         return AttemptRecording(
-            path=self.path, header=self.header, steps=tuple(steps), chunks=tuple(chunks), events=tuple(events),
-            final=finals[-1] if finals else None, outcomes=tuple(outcomes), adaptation_steps=tuple(progress),
-            adaptation=adaptations[-1] if adaptations else None, abandoned=abandonments[-1] if abandonments else "",
+            path=self.path, header=self.header, steps=tuple(steps), chunks=tuple(chunks), tick_times=tuple(times),
+            events=tuple(events), final=finals[-1] if finals else None, outcomes=tuple(outcomes),
+            adaptation_steps=tuple(progress), adaptation=adaptations[-1] if adaptations else None,
+            abandoned=abandonments[-1] if abandonments else "",
             frames={camera: len(frames) for camera, frames in self._frames.items()}, closed=self.found.closed,
             damaged=self.found.damaged or self._unreadable > 0, problems=tuple(self.problems), size=self.found.size,
         )  # fmt: skip

@@ -12,7 +12,7 @@ from functools import lru_cache
 from typing import Any
 
 from far_app.recording.codec import Json, codec
-from far_app.types import ActionChunk, Adaptation, AdaptationStep, Observation, Outcome, Step
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, Observation, Outcome, Step, TickTimes
 
 SCHEMA_NAME = "far-recording"
 SCHEMA_VERSION = 2
@@ -152,6 +152,13 @@ TOPICS = (
         "`observation.frames`: camera name to frame number on `/camera/<name>`.",
     ),
     Topic(name="/chunk", record=ActionChunk, schema_name="far.ActionChunk", what="Every chunk that became ready."),
+    Topic(
+        name="/tick_times",
+        record=TickTimes,
+        schema_name="far.TickTimes",
+        what="Every tick of the real-time loop, a few ticks late: the seconds it spent on each stage. Older recordings "
+        "and those made in lockstep have none.",
+    ),
     Topic(
         name="/camera/<name>",
         record=CompressedImage,

@@ -25,7 +25,7 @@ from far_app.recording.session_folder import (
     trial_folder,
 )
 from far_app.recording.weights_file import weights_path, write_weights
-from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step, TickTimes
 
 _SPACE_CHECK_INTERVAL = 5.0
 _LATE = 1.0
@@ -83,6 +83,9 @@ class SessionFiles:
 
     def chunk(self, stamp: float, chunk: ActionChunk) -> None:
         self._open.chunk(chunk, stamp)
+
+    def tick_times(self, stamp: float, times: TickTimes) -> None:
+        self._open.tick_times(times)
 
     def end_attempt(self, stamp: float, attempt: Attempt) -> None:
         file, outcome = self._open, attempt.outcome

@@ -27,7 +27,7 @@ from far_app.recording.scene_file import SceneAccepted
 from far_app.recording.schema import SCHEMA_VERSION, AttemptHeader, SessionInfo, json_schemas
 from far_app.recording.session_files import SessionFiles
 from far_app.recording.session_folder import SPACE_TO_GO_ON, SPACE_TO_START, attempt_name
-from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step, TickTimes
 
 log = logging.getLogger(__name__)
 
@@ -121,6 +121,11 @@ class SessionWriter:
         if step.tick > self._last_tick:
             self._last_tick = step.tick
             self._put(self._files.step, step)
+
+    def add_tick_times(self, times: TickTimes) -> None:
+        """Where a tick of the running attempt spent its time, once that is known."""
+        assert self._attempt > 0, "a tick's times need an attempt: call begin_attempt first"
+        self._put(self._files.tick_times, times)
 
     def add_chunk(self, chunk: ActionChunk) -> None:
         """A chunk, as it became ready. Late ones are taken until the attempt's file is closed."""

@@ -84,6 +84,8 @@ class ThreadedPlanner:
         self.failure: PolicyError | None = None
         self.seconds = 0.0
         """Duration of the last inference."""
+        self._spent = 0
+        """Nanoseconds of inference since `spent` was last asked."""
         self._changed = threading.Condition()
         self._policy: Policy | None = None
         self._request: tuple[int, PlanRequest] | None = None
@@ -137,6 +139,12 @@ class ThreadedPlanner:
         handed_out, self._handed_out = self._handed_out, []
         return handed_out
 
+    def spent(self) -> int:
+        """Nanoseconds of the inferences that ended since the last call."""
+        with self._changed:
+            spent, self._spent = self._spent, 0
+        return spent
+
     def close(self) -> None:
         with self._changed:
             self._closing = True
@@ -159,7 +167,7 @@ class ThreadedPlanner:
                 assert self._request is not None
                 (epoch, request), self._request = self._request, None
             chunk, failure = None, None
-            begun = time.monotonic()
+            begun = time.perf_counter_ns()
             try:
                 chunk = plan_one(request)
             except PolicyError as error:
@@ -168,7 +176,8 @@ class ThreadedPlanner:
                 failure = PolicyError(f"the policy failed at tick {request.tick}: {type(error).__name__}: {error}")
                 failure.__cause__ = error
             with self._changed:
-                self.seconds = time.monotonic() - begun
+                took = time.perf_counter_ns() - begun
+                self.seconds, self._spent = took / 1e9, self._spent + took
                 if epoch == self._epoch:
                     if chunk is not None:
                         self._ready.append(chunk)

@@ -10,7 +10,7 @@ from typing import Any
 from far_app.errors import RecordingError
 from far_app.recording.scene_file import SceneAccepted
 from far_app.recording.writer import SessionWriter
-from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step
+from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step, TickTimes
 
 
 class Recorder:
@@ -44,6 +44,9 @@ class Recorder:
 
     def add_step(self, step: Step) -> None:
         self._hand(lambda w: w.add_step(step))
+
+    def add_tick_times(self, times: TickTimes) -> None:
+        self._hand(lambda w: w.add_tick_times(times))
 
     def end_attempt(self, attempt: Attempt) -> None:
         self._hand(lambda w: w.end_attempt(attempt))

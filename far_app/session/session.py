@@ -37,6 +37,7 @@ from far_app.session.standing import IN_ATTEMPT, Standing
 from far_app.session.statistics import LoopStatistics
 from far_app.session.steering import Helper
 from far_app.session.supervision import Supervision, TrialAbandoned
+from far_app.session.timeline import AGGREGATE, INFER, OBSERVE, PUBLISH, RECORD
 from far_app.session.versions import VersionKeeper
 from far_app.session.watched import WatchedRobot
 from far_app.session_states import Happening, Intent, State
@@ -218,22 +219,31 @@ class Session:
 
     def _pass_tick(self, tick: Tick) -> float:
         """Bookkeeping of the last tick, then wait for this one's deadline and attend to what happened."""
+        timeline = self.statistics.timeline
         self.planner.go()
+        timeline.lap(AGGREGATE)
         if tick.step is not None and tick.step.tick == self._recorded:
             self._record(tick.step)
         self._report()
+        timeline.lap(RECORD)
         if tick.phase == "judging" and not self.board.reason:
             self.board.reason = f"success or failure? Say so within {self.detector.patience:g} s, or it is a failure"
             self.standing.say(self.board.reason)
         self.standing.show()
+        timeline.lap(PUBLISH)
         due = self.clock.wait()
+        timeline.begin(self._tick - tick.between if tick.phase == "attempt" else -1, due)
         held = self.supervision.attend(tick.phase)
         if held and tick.phase == "attempt" and self.standing.state in IN_ATTEMPT:
             if self.settings.demonstrate != "hand":
                 self._prime()
             self.clock.restart()
             due = AfterHold(self.clock.wait())
+            timeline.restart()
             self.supervision.attend(tick.phase)
+        elif held:
+            timeline.restart()
+        timeline.lap(OBSERVE)
         self._tick += not tick.between
         return due
 
@@ -275,7 +285,7 @@ class Session:
         attempt, standing = event.attempt, self.standing
         for step in attempt.steps[self._recorded :]:
             self._record(step)
-        self._report()
+        self._report(all_times=True)
         self.recorder.end_attempt(attempt)
         self.board.history.attempt_ended(self.board.trial, attempt)
         self.versions.attempt_ended(attempt.outcome.success)
@@ -300,7 +310,7 @@ class Session:
         """The trial's row and result; an attempt that was cut off has no outcome and is closed as such."""
         standing = self.standing
         if self._in_attempt:
-            self._report()
+            self._report(all_times=True)
             self._in_attempt = False
             self.recorder.abandon_attempt(self.board.reason or "the session was ended")
         if standing.marked is not None and self._attempts:
@@ -352,8 +362,12 @@ class Session:
         self.board.stepped(step)
         self.recorder.add_step(step)
 
-    def _report(self) -> None:
-        """New chunks, the operator's words on them and what is being learnt go to the page and the recording."""
+    def _report(self, *, all_times: bool = False) -> None:
+        """New chunks, the operator's words on them and what is being learnt go to the page and the recording; so do the
+        attempt's ticks whose times are complete, or all that are left."""
+        self.statistics.timeline.elsewhere(INFER, self.planner.spent())
+        for times in self.statistics.timeline.settled(all_of_them=all_times):
+            self.recorder.add_tick_times(times)
         for chunk in self.planner.handed_out():
             self.board.planned(chunk)
             self.recorder.add_chunk(chunk)

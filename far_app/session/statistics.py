@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from far_app.session.timeline import Timeline
 from far_app.telemetry import LoopHealth
 from far_app.types import Ack, Step
 
@@ -16,6 +17,8 @@ LATE = 0.005
 """Seconds after which a tick counts as late on the page."""
 OVERRUN = 0.033
 """Seconds after which a tick counts as overrun."""
+SHOWN = 300
+"""Ticks of the timeline on the page: ten seconds."""
 
 
 class LoopStatistics:
@@ -30,6 +33,8 @@ class LoopStatistics:
         """Seconds between an observation's capture and the tick that acted on it."""
         self.homing = array.array("d")
         """Seconds from an attempt's end to the next one's start."""
+        self.timeline = Timeline()
+        """Where each tick's time went."""
         self.ticks = 0
         self.starved = 0
         self.overruns = 0
@@ -50,6 +55,7 @@ class LoopStatistics:
 
     def sent(self, seq: int, due: float) -> None:
         """A target is on its way; one that is not answered within a second counts as an overrun."""
+        self.timeline.sent(seq)
         self._open[seq] = due
         if len(self._open) > 30:
             self.overruns += self._open.pop(next(iter(self._open)), None) is not None
@@ -57,6 +63,7 @@ class LoopStatistics:
     def acknowledged(self, ack: Ack) -> None:
         if self._open.pop(ack.seq, None) is None:
             return
+        self.timeline.acknowledged(ack)
         late = ack.accepted - ack.due
         self.late.append(late)
         self.overruns += late > OVERRUN
@@ -73,6 +80,7 @@ class LoopStatistics:
             late_p50_ms=float(np.percentile(late, 50)), late_p99_ms=float(np.percentile(late, 99)),
             late_max_ms=float(late.max()), late_ticks=int((late > LATE * 1e3).sum()), overruns=self.overruns,
             starved=self.starved, plan_age_ticks=float(np.median(ages)) if ages else 0.0,
+            stages=self.timeline.recent(SHOWN),
         )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
@@ -82,6 +90,7 @@ class LoopStatistics:
             "late_ms": percentiles(self.late, 1e3),
             "overruns": self.overruns,
             "starved": self.starved,
+            "stages_ms": self.timeline.percentiles(),
         }
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from far_app.protocols import Home, Request, Reset, Robot
 from far_app.session.statistics import LoopStatistics
+from far_app.session.timeline import SEND
 from far_app.types import Observation, Target
 
 
@@ -42,10 +43,14 @@ class WatchedRobot:
     def send(self, target: Target) -> None:
         self.statistics.sent(target.seq, target.due)
         self.gripper = target.gripper
+        began = time.perf_counter_ns()
         self.robot.send(target)
+        self.statistics.timeline.within(SEND, began)
 
     def request(self, request: Request) -> None:
+        began = time.perf_counter_ns()
         self.robot.request(request)
+        self.statistics.timeline.within(SEND, began)
         if isinstance(request, Home | Reset):
             self._asked_home = time.monotonic()
 

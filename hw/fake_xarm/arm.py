@@ -54,6 +54,8 @@ class FakeArm:
     enabled: bool = False
     error: int = 0
     warning: int = 0
+    floor: float = -math.inf
+    """Millimetres: what the hand, or what it holds, comes to stand on."""
     emergency: int = 0
     """The emergency stop that is pressed (1, 2 or 3); its error cannot be cleared until it is released."""
 
@@ -69,6 +71,7 @@ class FakeArm:
         way = goal - self.position
         distance = float(np.linalg.norm(way))
         self.position = goal.copy() if distance <= SPEED * seconds else self.position + way * SPEED * seconds / distance
+        self.position[2] = max(self.position[2], self.floor)
         turn = rotation_between(self.quaternion, orientation)
         angle = float(np.linalg.norm(turn))
         if angle <= TURN_SPEED * seconds:

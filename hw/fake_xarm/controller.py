@@ -45,8 +45,8 @@ class FakeController:
     async def run(self) -> None:
         """Serve the arm's ports and the control port until told to end. Raises RobotError where a port is taken."""
         try:
-            control = await asyncio.start_server(self._control, self.address, self.control_port)
             await self._listen()
+            control = await asyncio.start_server(self._control, self.address, self.control_port)
         except OSError as error:
             raise RobotError(
                 f"the fake controller cannot serve on {self.address} ({error.strerror}); end what listens there, or "
@@ -221,5 +221,6 @@ class FakeController:
         return {
             "mode": arm.mode, "state": int(arm.state), "error": arm.error, "enabled": arm.enabled,
             "position": arm.position.tolist(), "quaternion": arm.quaternion.tolist(), "gripper": hand.position,
-            "gripper_writes": hand.writes, "connections": len(self._writers), "now": time.monotonic(),
+            "gripper_writes": hand.writes, "gripper_speed": hand.speed, "gripper_force": hand.force,
+            "connections": len(self._writers), "now": time.monotonic(),
         }  # fmt: skip

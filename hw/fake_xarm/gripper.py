@@ -23,6 +23,9 @@ class FakeGripper:
         self.position = OPEN
         self.target = OPEN
         self.speed = 5000
+        """As written: r/min for a G1, a G2's own unit."""
+        self.force = 0
+        """A G2's, 1 to 100."""
         self.enabled = False
         self.error = 0
         self.object: float | None = None
@@ -64,7 +67,8 @@ class FakeGripper:
             self._go(struct.unpack(">i", words)[0])
         elif address == G2_MOVE and len(words) == 10:
             self.enabled = True
-            self._go(struct.unpack(">hhhi", words)[3])
+            _, self.speed, self.force, position = struct.unpack(">hhhi", words)
+            self._go(position)
 
     def _go(self, position: int) -> None:
         self.target = float(max(-10, min(OPEN, position)))

@@ -12,6 +12,7 @@ from typing import cast
 
 from xarm.wrapper import XArmAPI
 
+from far_app.scheduling import HARDWARE_PRIORITY, real_time_from_here
 from hw.xarm7.sdk import OK, gripper_error_text
 from hw.xarm7.settings import GripperSettings
 from hw.xarm7.units import gripper_position, opening
@@ -63,6 +64,7 @@ class Gripper:
             self._thread.join(timeout=2.0)
 
     def _run(self) -> None:
+        real_time_from_here(HARDWARE_PRIORITY)
         while not self._closing.wait(self._settings.period):
             try:
                 self._turn()

@@ -19,6 +19,7 @@ from xarm.core.utils.log import origin_logger as sdk_printer
 from xarm.wrapper import XArmAPI
 
 from far_app.errors import RobotError
+from far_app.scheduling import HARDWARE_PRIORITY, real_time_from_here
 from hw.xarm7.settings import XArmSettings
 
 log = logging.getLogger(__name__)
@@ -46,6 +47,7 @@ def connect(settings: XArmSettings, report: Report, timeout: float) -> XArmAPI:
     made: list[XArmAPI | Exception] = []
 
     def make() -> None:
+        real_time_from_here(HARDWARE_PRIORITY)  # the SDK's own threads, whoever connects: see far_app/scheduling.py
         try:
             made.append(
                 XArmAPI(

@@ -7,6 +7,14 @@ from typing import Literal
 
 from far_app.errors import ConfigError
 
+RANGES = {
+    "g1": {"open": (-10.0, 850.0), "closed": (-10.0, 850.0), "speed": (1000.0, 5000.0)},
+    "g2": {"open": (0.0, 84.0), "closed": (0.0, 84.0), "speed": (15.0, 225.0), "force": (1.0, 100.0)},
+}
+"""What each hand takes (vendor)."""
+REACH = 0.5
+"""Metres from the flange within which a tool centre point or a load's centre can lie: more was meant in millimetres."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class GripperSettings:
@@ -27,10 +35,18 @@ class GripperSettings:
     """Share of the stroke by which a command must change before it is sent."""
 
     def __post_init__(self) -> None:
-        if self.kind != "none" and self.open == self.closed:
-            raise ConfigError(f"xarm.gripper open and closed are both {self.open}; they must differ")
+        if self.kind == "none":
+            return
+        for name, (low, high) in RANGES[self.kind].items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ConfigError(f"xarm.gripper.{name} is {value:g}, a {self.kind}'s must be {low:g} to {high:g}")
+        if self.open == self.closed:
+            raise ConfigError(f"xarm.gripper open and closed are both {self.open:g}; they must differ")
         if self.period < 0.1:
             raise ConfigError(f"xarm.gripper.period is {self.period} s, must be at least 0.1: the line is slow")
+        if not 0.0 <= self.hysteresis <= 0.5:
+            raise ConfigError(f"xarm.gripper.hysteresis is {self.hysteresis}, must be 0 to 0.5 of the stroke")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,10 +82,13 @@ class XArmSettings:
             ("port", self.port, 1, 65535), ("collision_sensitivity", self.collision_sensitivity, 1, 5),
             ("servo_step", self.servo_step, 1e-5, 0.010), ("servo_turn", self.servo_turn, 1e-4, 0.1),
             ("call_timeout", self.call_timeout, 0.02, 1.0), ("connect_timeout", self.connect_timeout, 1.0, 120.0),
-            ("load_mass", self.load_mass, 0.0, 3.5),
+            ("load_mass", self.load_mass, 0.0, 3.5), ("latency_limit", self.latency_limit, 0.001, 0.05),
         )  # fmt: skip
         for name, value, low, high in limits:
             if not low <= value <= high:
                 raise ConfigError(f"xarm.{name} is {value}, must be {low} to {high}")
         if len(self.tcp_offset) != 6 or len(self.load_center) != 3:
             raise ConfigError("xarm.tcp_offset takes 6 values (metres, radians), xarm.load_center 3 (metres)")
+        for name, lengths in (("tcp_offset", self.tcp_offset[:3]), ("load_center", self.load_center)):
+            if not all(abs(length) <= REACH for length in lengths):
+                raise ConfigError(f"xarm.{name} is {lengths}, must be within {REACH} m of the flange; it is in metres")

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 from xarm.wrapper import XArmAPI
 
+from far_app.scheduling import HARDWARE_PRIORITY, real_time_from_here
 from hw.xarm7.sdk import OK, write_state_frame
 
 log = logging.getLogger(__name__)
@@ -53,6 +54,7 @@ class StopLine:
         self._thread.join(timeout=2.0)
 
     def _confirm(self) -> None:
+        real_time_from_here(HARDWARE_PRIORITY)
         while not self._closing:
             self._asked.wait()
             self._asked.clear()

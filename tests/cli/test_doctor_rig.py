@@ -51,6 +51,20 @@ def test_what_differs_is_told_with_both_values(fake: FakeXArm, tmp_path: Path, c
     assert fake.state()["error"] == 35, "a doctor clears nothing"
 
 
+G2 = 'kind = "g2"\nopen = 84.0\nclosed = 0.0\nspeed = 150.0\nforce = 40.0\n'
+
+
+def test_a_g2_is_asked_as_one(fake: FakeXArm, tmp_path: Path, capsys) -> None:
+    rig = tmp_path / "mine.toml"
+    g1 = 'kind = "g1"\nopen = 850.0\nclosed = 0.0\nspeed = 3000.0\n'
+    text = (RIGS / "xarm7.toml").read_text()
+    assert g1 in text
+    rig.write_text(text.replace(g1, G2))
+    assert doctor(fake, str(rig)) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "gripper" in line)
+    assert line.startswith("ok   gripper    g2 at 8"), "millimetres"
+
+
 def test_no_controller_is_one_line(capsys) -> None:
     assert main(["doctor", "--rig", "xarm7", "--host", f"{loopback()}:{FAKE_PORT}"]) == 1
     assert "BAD  controller no xArm controller at" in capsys.readouterr().out

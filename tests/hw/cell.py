@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from far_app.config import TaskConfig
 from far_app.motion import TargetIntegrator
-from far_app.protocols import Heartbeat, Home
+from far_app.protocols import Heartbeat, Hold, Home, Resume
 from far_app.tasks import task
 from far_app.types import RobotStatus
 from hw.controller import ArmController
@@ -33,10 +34,10 @@ def rig_at(fake: FakeXArm, port: int) -> RigConfig:
 class Cell:
     """Everything of the hw server but its sockets."""
 
-    def __init__(self, fake: FakeXArm, rig: RigConfig) -> None:
+    def __init__(self, fake: FakeXArm, rig: RigConfig, task: TaskConfig = TASK) -> None:
         self.fake, self.rig = fake, rig
-        self.plant = XArmPlant(rig, TASK)
-        self.servo = ServoThread(self.plant, ArmController(rig, TASK, 100, self.plant.measure()), TASK.rate)
+        self.plant = XArmPlant(rig, task)
+        self.servo = ServoThread(self.plant, ArmController(rig, task, 100, self.plant.measure()), task.rate)
         self.servo.start()
 
     @property
@@ -54,15 +55,23 @@ class Cell:
             time.sleep(0.005)
         raise AssertionError(f"it never came to that: {status}")
 
-    def go_home(self, limit: float = 10.0) -> None:
+    def request(self, request: Home | Hold | Resume | Heartbeat) -> None:
+        """Raises RobotError where it is refused."""
         with self.servo.locked() as controller:
-            controller.request(Home(), time.monotonic())
+            controller.request(request, time.monotonic())
+
+    def go_home(self, limit: float = 10.0) -> None:
+        self.request(Home())
+        self.beat_until(lambda s: s.at_home, limit)
+
+    def beat_until(self, what: Callable[[RobotStatus], bool], limit: float = 10.0) -> RobotStatus:
+        """Lets homing go on until a status shows it."""
         deadline = time.monotonic() + limit
-        while not self.status.at_home:
-            assert time.monotonic() < deadline, f"not home: {self.status}"
-            with self.servo.locked() as controller:
-                controller.request(Heartbeat(), time.monotonic())
+        while not what(status := self.status):
+            assert time.monotonic() < deadline, f"it never came to that: {status}"
+            self.request(Heartbeat())
             time.sleep(1 / TASK.rate)
+        return status
 
     def drive(self, action: np.ndarray, ticks: int, until_held: bool = False) -> int:
         """The same action for a while, as a session would; returns how many targets were refused."""
@@ -92,4 +101,4 @@ class Cell:
 
 def steps(targets: list[dict]) -> np.ndarray:
     """Millimetres between successive servo targets."""
-    return np.linalg.norm(np.diff(np.array([t["pose"][:3] for t in targets]), axis=0), axis=1)
+    return np.linalg.norm(np.diff(np.array([t["pose"][:3] for t in targets]).reshape(-1, 3), axis=0), axis=1)

@@ -153,9 +153,9 @@ class XArmBench(RemoteBench):
 
     rig, cameras = XARM, ()
 
-    def __init__(self, robot: RemoteRobot, fake: FakeXArm) -> None:
+    def __init__(self, robot: RemoteRobot, fake: FakeXArm, server: HwProcess) -> None:
         super().__init__(robot)
-        self.fake = fake
+        self.fake, self.server = fake, server
 
     def start(self, seed: int) -> Observation:
         self.robot.request(Resume())
@@ -228,7 +228,7 @@ def xarm(fake: FakeXArm, tmp_path_factory: pytest.TempPathFactory) -> Iterator[X
     server = HwProcess("--rig", str(hurried), "--address", f"{fake.address}:{FAKE_PORT}")
     assert server.handshake.get("ready"), server.handshake
     robot = RemoteRobot(server.endpoints)
-    yield XArmBench(robot, fake)
+    yield XArmBench(robot, fake, server)
     robot.close()
     assert server.close() == 0
 

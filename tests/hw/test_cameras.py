@@ -14,7 +14,7 @@ from far_app.picture import seen
 from far_app.protocols import Camera
 from far_app.tasks import supervised
 from hw.camera_config import CameraConfig, views_of, with_views
-from hw.camera_reader import CameraReader
+from hw.camera_reader import CameraReader, digest
 from hw.capture import Shot, capture_for
 from hw.hardware_view import HardwareView
 from hw.rig import RIGS, load_rig
@@ -252,3 +252,18 @@ def test_the_papers_rig_is_one_view_of_a_zed_minis_left_eye():
     assert (camera.width, camera.height, camera.rate, camera.eye) == (2560, 720, 60.0, "left")
     entry = supervised(with_views(TASK, rig.cameras))
     assert (entry.cameras, entry.max_attempts, entry.judge) == (("front",), 3, "person")
+
+
+def test_a_synthetic_camera_is_in_the_trouble_that_its_file_names(tmp_path):
+    file = tmp_path / "trouble"
+    capture = SyntheticCapture(CameraConfig(device=f"synthetic:{file}", width=64, height=48, rate=500.0))
+    capture.open()
+    assert capture.grab().stamp < capture.grab().stamp, "no file, no trouble"
+    file.write_text("frozen")
+    assert digest(capture.grab()) == digest(capture.grab())
+    file.write_text("unplugged\n")
+    with pytest.raises(RobotError, match="unplugged"):
+        capture.grab()
+    file.write_text("")
+    capture.open()
+    capture.grab()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -148,6 +150,7 @@ def test_the_gripper_follows_without_stalling_the_servo_loop(cell: Cell, fake: F
     targets, state = fake.servo_targets(), fake.state()
     assert fake_at["gripper"] > 800 and state["gripper"] < 100
     assert state["gripper_writes"] - writes == 1, "told once; a change within the hysteresis is not told"
+    assert state["gripper_speed"] == cell.rig.xarm.gripper.speed
     assert cell.servo.newest.measured.gripper < 0.1, "its opening is read back"
     assert np.percentile(np.diff([t["at"] for t in targets]), 95) < 0.02
     cell.go_home()
@@ -172,10 +175,13 @@ def test_starting_leaves_what_the_hand_holds_in_the_hand(fake: FakeXArm) -> None
 @pytest.mark.slow
 def test_a_g2_gripper_is_told_millimetres(fake: FakeXArm) -> None:
     rig = rig_at(fake, FAKE_PORT)
-    g2 = replace(rig.xarm.gripper, kind="g2", open=84.0, closed=0.0, speed=150.0)
+    g2 = replace(rig.xarm.gripper, kind="g2", open=84.0, closed=0.0, speed=150.0, force=40.0)
     cell = Cell(fake, replace(rig, xarm=replace(rig.xarm, gripper=g2)))
     cell.drive(np.array((0, 0, 0, 0, 0, 0, 1.0)), 30)
     assert cell.servo.newest.measured.gripper < 0.1
+    state = fake.state()
+    assert state["gripper_force"] == 40
+    assert state["gripper_speed"] == int((150 * 60 / 9.88235 + 140) / 0.4), "mm/s in the hand's own unit (SDK)"
     cell.drive(np.array((0, 0, 0, 0, 0, 0, -1.0)), 30)
     assert cell.servo.newest.measured.gripper > 0.9
     cell.close()
@@ -222,7 +228,7 @@ def test_a_tool_that_differs_is_set_before_servo_mode(fake: FakeXArm) -> None:
 
 def test_a_rig_faster_than_its_servo_step_is_refused() -> None:
     rig = load_rig("xarm7")
-    with pytest.raises(ConfigError, match=r"servo step of at most 2\.5 mm at 100 Hz allows 0\.25 m/s"):
+    with pytest.raises(ConfigError, match=r"servo ticks of at most 0\.0025 m at 100 Hz allow 0\.25 m/s"):
         replace(rig, safety=replace(rig.safety, speed=0.4))
 
 
@@ -236,3 +242,15 @@ def test_a_latching_hold_stops_the_arm_at_its_controller_too(xarm: XArmBench) ->
     xarm.robot.request(Resume())
     assert xarm.fake.state()["mode"] == 1
     assert xarm.robot.observe().status.mode is RobotMode.HOLD
+
+
+def test_no_thread_beside_stop_may_wait_for_a_core_while_it_holds_the_interpreter(xarm: XArmBench) -> None:
+    """Those of the SDK included, also after it connected anew."""
+    if xarm.server.handshake["scheduling"] != "fifo":
+        pytest.skip("real time is not permitted here")
+    xarm.fake.tell(do="cut")
+    xarm.until(lambda o: o.status.fault)
+    xarm.robot.request(Resume())
+    threads = [int(path.name) for path in Path(f"/proc/{xarm.server.process.pid}/task").iterdir()]
+    assert len(threads) > 10
+    assert {os.sched_getscheduler(thread) & ~os.SCHED_RESET_ON_FORK for thread in threads} == {os.SCHED_FIFO}

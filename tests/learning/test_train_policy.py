@@ -5,12 +5,14 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 from far_app.errors import ConfigError, RecordingError
 from far_app.learning.dataset import Episode, check_origin, read_episodes, write_episode
 from far_app.learning.policy import fingerprint, load_policy, preset
+from far_app.learning.policy_step import FastStep, PlainStep
 from far_app.learning.segments import DemonstrationArrays
-from far_app.learning.train_policy import PolicyTraining, learning_rate, train_policy
+from far_app.learning.train_policy import PolicyTraining, begun, learning_rate, train_policy
 from hw.camera_config import CameraConfig
 from hw.camera_reader import CameraReader
 from hw.capture import Shot
@@ -86,6 +88,37 @@ def test_an_interrupted_run_ends_with_the_same_weights(tmp_path, monkeypatch):
     monkeypatch.undo()
     resumed = train_policy(episodes(), CONFIG, TRAINING, tmp_path / "parts")
     assert fingerprint(load_policy(resumed)) == fingerprint(load_policy(whole))
+
+
+@pytest.mark.parametrize("name", ["quickstart", "paper", "state"])
+def test_a_fast_step_is_the_plain_one(name):
+    """The same losses and the same weights after some steps from the same batches and the same noise."""
+    config = dataclasses.replace(preset(name, "lift"), image_size=32, widths=(16, 32, 64))
+    training = dataclasses.replace(TRAINING, shift=2 * bool(config.cameras), lr=1e-3)
+    arrays = DemonstrationArrays(episodes(size=32), config, training.shift)
+    losses: dict[type[PlainStep], list[float]] = {PlainStep: [], FastStep: []}
+    moved = {}
+    for form, kept in losses.items():
+        torch.manual_seed(0)
+        step = begun(form, config, training, arrays)
+        rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
+        for _ in range(5):
+            loss = step.loss(arrays.segments(2, 4, rng), generator, torch.linspace(0.5, 1.5, 8))
+            step.update(loss, 1e-3, decay=0.5)
+            kept.append(loss.item())
+        moved[form] = torch.cat([p.flatten() for p in step.ema.parameters()])
+    assert losses[FastStep] == pytest.approx(losses[PlainStep], rel=1e-4)
+    apart = (moved[FastStep] - moved[PlainStep]).abs()
+    assert apart.mean() < 2e-5, "AdamW makes 1e-3 of the smallest gradient: a few weights may differ"
+
+
+def test_a_run_by_plain_steps_learns_the_same(tmp_path):
+    logs = {}
+    for plain in (True, False):
+        train_policy(episodes(), CONFIG, TRAINING, tmp_path / str(plain), plain=plain)
+        lines = (tmp_path / str(plain) / "log.jsonl").read_text().splitlines()
+        logs[plain] = [json.loads(line)["loss"] for line in lines]
+    assert len(logs[True]) == 3 and logs[False] == pytest.approx(logs[True], rel=1e-3)
 
 
 def test_the_loss_falls_on_one_demonstration(tmp_path):

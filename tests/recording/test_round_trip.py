@@ -5,11 +5,14 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from PIL import Image
 
-from far_app.recording.images import decode_png, encode_png
+from far_app.errors import RecordingError
+from far_app.recording.images import decode_png, encode_png, stored_png
 from far_app.recording.reader import read_attempt, read_session
 from far_app.types import AdaptationStep, Judge, Outcome
 
@@ -29,6 +32,9 @@ def test_a_round_trip_loses_nothing(tmp_path: Path) -> None:
         writer.add_step(step)  # a paused driver gives the same step again
     for chunk in chunks[10:]:
         writer.add_chunk(chunk)
+    times = [values.tick_times(tick) for tick in range(13)]
+    for tick in times:
+        writer.add_tick_times(tick)
     writer.event("paused", "by the operator", {"tick": 4})
     writer.end_attempt(attempt)
     for step in progress:
@@ -48,6 +54,7 @@ def test_a_round_trip_loses_nothing(tmp_path: Path) -> None:
     assert values.same(first.attempt(), attempt)
     assert values.same(second.attempt(), retry)
     assert values.same(first.chunks, tuple(chunks))
+    assert first.tick_times == tuple(times) and second.tick_times == ()
     assert values.same(first.adaptation, values.adaptation(12))
     assert first.adaptation_steps == tuple(progress)
     assert [(e.event, e.text, e.detail) for e in first.events] == [("paused", "by the operator", {"tick": 4})]
@@ -119,7 +126,16 @@ def test_the_mcap_library_reads_the_file_by_its_index(tmp_path: Path) -> None:
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1))
 def test_frames_are_lossless(height: int, width: int, seed: int) -> None:
     image = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(decode_png(encode_png(image)), image)
+    for png in (encode_png(image), stored_png(image)):
+        np.testing.assert_array_equal(decode_png(png), image)
+        np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(png))), image)
+
+
+def test_frames_of_another_kind_are_refused() -> None:
+    for frame in (np.zeros((4, 4, 3)), np.zeros((4, 4), np.uint8), np.zeros((4, 4, 4), np.uint8)):
+        for encode in (encode_png, stored_png):
+            with pytest.raises(RecordingError, match="frames are uint8 H × W × 3"):
+                encode(frame)
 
 
 def test_a_session_never_overwrites_another(tmp_path: Path) -> None:

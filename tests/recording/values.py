@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from far_app.types import (
+    TICK_STAGES,
     Ack,
     ActionChunk,
     Adaptation,
@@ -21,6 +22,7 @@ from far_app.types import (
     RobotMode,
     RobotStatus,
     Step,
+    TickTimes,
 )
 
 CAMERAS = ("front", "wrist")
@@ -68,6 +70,11 @@ def chunk(tick: int, *, candidates: int = 0) -> ActionChunk:
         tick=tick, actions=rng.uniform(-1, 1, (8, 7)), policy_version="base", value=-0.5,
         candidates=rng.uniform(-1, 1, (candidates, 8, 7)).astype(np.float32) if candidates else None,
     )  # fmt: skip
+
+
+def tick_times(tick: int, start: float = 1000.0) -> TickTimes:
+    spent = {stage: (tick + 1) * 1e-6 * (i + 1) for i, stage in enumerate(TICK_STAGES)}
+    return TickTimes(tick=tick, stamp=start + tick / 30, **spent)
 
 
 def attempt(index: int, steps: int, start: float = 1000.0, success: bool = False) -> Attempt:

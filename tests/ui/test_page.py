@@ -14,6 +14,7 @@ from ui_process import PageProcess, free_port, wait_until
 from ui_stage import Stage, adapting, running, stopped
 
 from far_app.session_states import Intent, State
+from far_app.telemetry import CameraHealth
 from far_app.types import RobotMode
 from ui.keys import Page, keys_of
 
@@ -321,3 +322,13 @@ def test_a_second_browser_that_comes_late_sees_everything(tab: Any, browser: Any
     late.close()
     source.mode = RobotMode.HOMING
     tab.wait_for_selector("#op-state:has-text('arm goes home')")
+
+
+def test_trouble_with_a_camera_stands_above_its_picture(tab: Any, source: Stage) -> None:
+    source.cameras = {"front": CameraHealth(frames=900, dropped=12, stale=3, age=0.02)}
+    tab.wait_for_selector(".mark-front.tone-idle em:has-text('12 dropped · 3 stale')")
+    source.cameras = {"front": CameraHealth(frames=900, frozen=30, age=0.8)}
+    tab.wait_for_selector(".mark-front.tone-warn em:has-text('picture 0.8 s old · 30 frozen')")
+    assert tab.inner_text(".mark-wrist em") == ""
+    source.cameras = {}
+    tab.wait_for_selector(".mark-front.tone-idle")

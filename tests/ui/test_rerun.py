@@ -57,7 +57,8 @@ def failed_attempt(path: Path) -> AttemptRecording:
         previous="", wall_minus_monotonic=0.0,
     )  # fmt: skip
     return AttemptRecording(
-        path=path, header=header, steps=steps, chunks=(), final=replace(steps[-1].observation, stamp=101.0),
+        path=path, header=header, steps=steps, chunks=(), tick_times=(),
+        final=replace(steps[-1].observation, stamp=101.0),
         events=(RecordedEvent(stamp=100.5, event="note", text="a note"),),
         outcomes=(Outcome(success=False, judged_by=Judge.HORIZON),), adaptation_steps=(), adaptation=adaptation,
         frames={"front": 30, "wrist": 30}, abandoned="", closed=True, damaged=False, problems=(), size=0,

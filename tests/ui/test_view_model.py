@@ -9,11 +9,11 @@ import pytest
 from ui_stage import adapting, rows, running, stopped
 
 from far_app.session_states import Intent, State
-from far_app.telemetry import LoopHealth, Telemetry
+from far_app.telemetry import CameraHealth, LoopHealth, Telemetry
 from far_app.types import RobotMode, RobotStatus
 from ui import html
 from ui.stop import StopResult
-from ui.view_model import Freshness, Tone, adaptation, arm_word, banner, control, loop_gauges, summary
+from ui.view_model import Freshness, Tone, adaptation, arm_word, banner, camera_note, control, loop_gauges, summary
 
 FRESH = Freshness(app=0.05, hw=0.05)
 
@@ -141,3 +141,13 @@ def test_the_stop_note_never_claims_an_unconfirmed_latch() -> None:
     assert "NOT CONFIRMED" in html.stop_note(StopResult(pressed=0, latched=False), False, "")
     assert "latched in 12 ms" in html.stop_note(StopResult(pressed=0, latched=True, latency_ms=12.3), True, "STOP")
     assert "latched" not in html.stop_note(StopResult(pressed=0, latched=True, latency_ms=12.3), False, "")
+
+
+def test_a_camera_that_is_well_and_one_that_is_drawn_say_nothing() -> None:
+    assert camera_note(None) == camera_note(CameraHealth(frames=900, age=0.04)) == ("", Tone.IDLE)
+
+
+def test_a_camera_says_what_went_wrong_so_far_and_warns_only_while_it_does() -> None:
+    ill = CameraHealth(frames=900, dropped=12, frozen=40, reopened=2, age=0.02)
+    assert camera_note(ill) == ("12 dropped · 40 frozen · back 2×", Tone.IDLE)
+    assert camera_note(replace(ill, age=1.34)) == ("picture 1.3 s old · 12 dropped · 40 frozen · back 2×", Tone.WARN)

@@ -22,6 +22,7 @@ from far_app.endpoints import Endpoints
 from far_app.session_states import Intent, State
 from far_app.telemetry import (
     BodyMesh,
+    CameraHealth,
     GeometryRequest,
     LogLine,
     LoopHealth,
@@ -52,10 +53,19 @@ def running(tick: int = 87, attempt: int = 1) -> Telemetry:
         joints=np.linspace(-1, 1, 7), action=np.full(7, 0.1),
         chunk_path=np.stack([np.linspace(0.4, 0.45, H), np.linspace(0, 0.1, H), np.linspace(0.2, 0.1, H)], axis=1),
         loop=LoopHealth(hz=29.98, ticks=4312, late_p50_ms=0.4, late_p99_ms=1.7, late_max_ms=4.2, late_ticks=0,
-                        plan_age_ticks=1.0),
+                        plan_age_ticks=1.0, stages=stages(4312)),
         history=rows(), log=lines(), allowed=(Intent.STOP, Intent.PAUSE, Intent.MARK_SUCCESS, Intent.MARK_FAILURE,
                                               Intent.SKIP_TRIAL, Intent.QUIT),
     )  # fmt: skip
+
+
+def stages(seed: int) -> np.ndarray:
+    """Ten seconds of ticks with a hiccup."""
+    rng = np.random.default_rng(seed)
+    typical = np.array([0.6, 9.0, 0.9, 0.1, 0.15, 0.3, 0.2], np.float32)
+    ms = typical * rng.gamma(12, 1 / 12, (300, 7)).astype(np.float32)
+    ms[200, 0] = 28.0
+    return ms
 
 
 def adapting() -> Telemetry:
@@ -113,8 +123,12 @@ class Stage:
         self.advance = False
         """Let the attempt's tick go on by itself."""
         self.mode = RobotMode.TRACKING
+        self.cameras: dict[str, CameraHealth] = {}
+        """Empty, as on the twin."""
         self.intents: list[OperatorIntent] = []
         self.present: list[PagePresence] = []
+        self.words: list[Any] = []
+        """Nudges, marks and wishes."""
         self.stops: list[StopRequest] = []
         self.stop_answers = True
         self._bodies = bodies
@@ -161,15 +175,17 @@ class Stage:
         latched = self.mode is RobotMode.LATCHED
         status = RobotStatus(mode=self.mode, reason="STOP by the operator" if latched else "")
         jpegs = {name: picture(name, seq) for name in ("front", "wrist")}
-        return View(seq=seq, stamp=now, jpegs=jpegs, body_poses=poses, status=status)
+        return View(seq=seq, stamp=now, jpegs=jpegs, body_poses=poses, status=status, cameras=self.cameras)
 
     def _answer(self) -> None:
         while self._pull.poll(0):
             message = unpack(self._pull.recv())
             if isinstance(message, OperatorIntent):
                 self.intents.append(message)
-            else:
+            elif isinstance(message, PagePresence):
                 self.present.append(message)
+            else:
+                self.words.append(message)
         if self._geometry.poll(0):
             assert isinstance(unpack(self._geometry.recv()), GeometryRequest)
             vertices, faces = cube(0.08)

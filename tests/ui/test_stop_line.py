@@ -1,0 +1,40 @@
+"""STOP's line, from the page's process to the hw server, by itself."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from ui_stage import Stage
+
+from far_app.endpoints import Endpoints
+from far_app.scheduling import real_time
+from ui.stop import StopLine
+
+
+def policies() -> dict[int, int]:
+    return {
+        int(task.name): os.sched_getscheduler(int(task.name)) & ~os.SCHED_RESET_ON_FORK
+        for task in Path("/proc/self/task").iterdir()
+    }
+
+
+def test_no_thread_of_the_line_waits_for_a_core_behind_other_programs(folder: Path, stage: Stage) -> None:
+    granted: list[str] = []
+    asking = threading.Thread(target=lambda: granted.append(real_time(1)))
+    asking.start()
+    asking.join()
+    if granted != ["fifo"]:
+        pytest.skip("real time is not permitted here")
+    before = policies()
+    line = StopLine(Endpoints.in_folder(folder))
+    line.press("test")
+    deadline = time.monotonic() + 5.0
+    while not (line.result is not None and line.result.latched) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    new = {policy for thread, policy in policies().items() if thread not in before}
+    assert line.result is not None and line.result.latched and new == {os.SCHED_FIFO}
+    line.close()
