@@ -49,6 +49,12 @@ class Board:
         self.adapting = False
         self.trial = self.attempt = self.scene_seed = 0
         self.policy_version = ""
+        self.plan: PlanShown | None = None
+        self.scene: SceneShown | None = None
+        """A real scene of a plan that is being rebuilt."""
+        self.blind = False
+        """Nothing that gives the method away is shown."""
+        self._max_attempts = task.max_attempts
         self.engine = EngineReport(name="")
         """What runs the policy of the attempt."""
         self.plan: PlanShown | None = None

@@ -31,6 +31,7 @@ class KinematicPlant:
     """An arm that is where it was told to be, at the rate of the real one."""
 
     servo_hz = 100
+    guided = False
 
     def __init__(self) -> None:
         self.pose = Pose(position=np.array(RIG.start_position), quaternion=np.array(RIG.start_quaternion))
