@@ -62,7 +62,7 @@ class Camera:
 
     def shows(self, mark: str) -> bool:
         """Now."""
-        return bool(self.page.evaluate("mark => document.querySelector(mark) !== null", f"#op-state{mark}"))
+        return self.page.locator(f"#op-state{mark}").count() > 0
 
     def state(self, word: str, more: str = "") -> None:
         self.until(f"#op-state[data-state='{word}']{more}")
@@ -82,10 +82,10 @@ TWIN = {
     "learning": "[data-state='LEARNING']",
     "retry": "[data-state='RUNNING']:not([data-attempt='1'])",
 }
-ARM = {"start": "[data-state='GOING HOME']", "success": "[data-state='SUCCESS']"}
 """Pictures of what goes by: taken whenever the page shows it, in whatever order it comes. What lasts a second only is
 taken on the fake arm, whose page has no 3D view to draw."""
-LIVE_PATIENCE = 150.0
+SOLVED = "[data-state='SET THE SCENE']:has-text('solved')"
+LIVE_PATIENCE = 200.0
 """Seconds for all of them."""
 
 
@@ -147,6 +147,8 @@ def take_what_goes_by(camera: Camera, marks: dict[str, str], keys: dict[str, str
         for state, key in keys.items():
             if camera.shows(f"[data-state='{state}']"):
                 camera.page.keyboard.press(key)
+        if set(wanted) == {"running"} and camera.shows("[data-state='RUNNING']:not([data-attempt='1'])"):
+            camera.page.keyboard.press("k")  # on to another trial's first attempt
         camera.page.wait_for_timeout(50)
 
 
@@ -185,10 +187,11 @@ def arm(browser: Any, recordings: Path) -> None:
             camera.page.keyboard.press("n")
             camera.until("#op-state:has-text(' in 3 s'), #op-state:has-text(' in 2 s')")
             camera.take("countdown", settle=0.2)
-            take_what_goes_by(camera, ARM, {"SET THE SCENE": "n", "RUNNING": "s"}, settle=0.0)
-            camera.until("#op-state[data-state='RUNNING'], #op-state[data-state='SET THE SCENE']")
-            camera.page.keyboard.press("n")
-            camera.state("RUNNING")
+            take_what_goes_by(camera, {"solved": SOLVED}, {"RUNNING": "s"}, settle=1.0)
+            take_what_goes_by(
+                camera, {"start": "[data-state='GOING HOME']"}, {"SET THE SCENE": "n", "RUNNING": "s"}, 0.0
+            )
+            take_what_goes_by(camera, {"arm_running": "[data-state='RUNNING']"}, {"SET THE SCENE": "n"}, 1.0)
             subprocess.run([*FAR, "fake-xarm", "tell", "error", "31"], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
             camera.state("FAULT")
             camera.take("fault")

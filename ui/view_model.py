@@ -83,6 +83,9 @@ def banner(telemetry: Telemetry | None, fresh: Freshness) -> Banner:
         return Banner(word="WAITING", tone=Tone.WARN, detail="No word from the app yet: it is starting, or gone.")
     word, tone = WORDS[telemetry.state]
     detail = _detail(telemetry)
+    if telemetry.state in (State.HOMING, State.AWAITING_SCENE) and telemetry.history:
+        last = telemetry.history[-1]  # TRIAL DONE itself lasts but a moment
+        detail = f"Trial {last.trial} {'solved' if last.success else 'not solved'}. {detail}"
     if telemetry.state is State.TRIAL_DONE and telemetry.history:
         success = telemetry.history[-1].success
         word, tone = ("SUCCESS", Tone.GOOD) if success else ("NOT SOLVED", Tone.WARN)

@@ -59,6 +59,15 @@ def test_a_trial_s_outcome_is_named() -> None:
     assert banner(replace(done, history=rows()), FRESH).word == "NOT SOLVED"
 
 
+@pytest.mark.parametrize("state", [State.HOMING, State.AWAITING_SCENE])
+def test_before_the_next_trial_the_last_one_s_outcome_is_told(state: State) -> None:
+    rows_ = rows()
+    telemetry = replace(running(), state=state, history=rows_[:2])
+    assert banner(telemetry, FRESH).detail.startswith("Trial 2 solved. ")
+    assert banner(replace(telemetry, history=rows_), FRESH).detail.startswith("Trial 3 not solved. ")
+    assert "solved" not in banner(replace(telemetry, history=()), FRESH).detail
+
+
 @pytest.mark.parametrize("intent", list(Intent))
 @pytest.mark.parametrize("state", list(State))
 def test_a_disabled_button_says_why_and_an_allowed_one_is_enabled(intent: Intent, state: State) -> None:
