@@ -9,11 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from far_app.session_states import Intent, State
-<<<<<<< .merge_file_INN1su
 from far_app.telemetry import HIDDEN, CameraHealth, Telemetry, TrialRow
-=======
-from far_app.telemetry import HIDDEN, Telemetry, TrialRow
->>>>>>> .merge_file_tAFPUP
 from far_app.types import RobotMode, RobotStatus
 
 SILENT_AFTER = 1.5
