@@ -77,25 +77,25 @@ class Camera:
         self.page.locator(f"button:has-text('{label}'):not(:disabled)").first.click(timeout=PATIENCE)
 
 
-LIVE: dict[str, str] = {
-    "start": "[data-state='GOING HOME']",
+TWIN = {
     "running": "[data-state='RUNNING'][data-attempt='1']",
     "learning": "[data-state='LEARNING']",
     "retry": "[data-state='RUNNING']:not([data-attempt='1'])",
-    "success": "[data-state='SUCCESS']",
 }
-"""Pictures of what goes by: taken whenever the page shows it, in whatever order it comes."""
+ARM = {"start": "[data-state='GOING HOME']", "success": "[data-state='SUCCESS']"}
+"""Pictures of what goes by: taken whenever the page shows it, in whatever order it comes. What lasts a second only is
+taken on the fake arm, whose page has no 3D view to draw."""
 LIVE_PATIENCE = 150.0
 """Seconds for all of them."""
 
 
 def twin(browser: Any, recordings: Path) -> None:
     """A session on the twin, from its start to the loss of the page."""
-    words = ("run", "--trials", "99", "--seed", "7", "--port", "0", "--no-rerun", "--recordings", str(recordings))
-    with program(*words) as (process, url):
+    words = ("run", "--trials", "99", "--seed", "7", "--port", "0", "--no-rerun")
+    with program(*words, "--recordings", str(recordings / "twin")) as (process, url):
         camera = Camera(browser, url)
         camera.until("#op-state:not([data-state='WAITING'])")
-        take_what_goes_by(camera)
+        take_what_goes_by(camera, TWIN, {}, settle=0.8)
         camera.until("#op-state[data-state='RUNNING']")
         camera.page.keyboard.press("p")
         camera.state("PAUSED")
@@ -131,27 +131,28 @@ def twin(browser: Any, recordings: Path) -> None:
         camera.page.close()
 
 
-def take_what_goes_by(camera: Camera) -> None:
-    """All of LIVE. A picture counts when the page shows the state before and after it; an attempt that goes on without
-    failing is helped by a mark."""
-    wanted, began = dict(LIVE), time.monotonic()
+def take_what_goes_by(camera: Camera, marks: dict[str, str], keys: dict[str, str], settle: float) -> None:
+    """All of `marks`. A picture counts when the page shows the state before and after it. `keys`: what to press in
+    which state meanwhile."""
+    wanted, began = dict(marks), time.monotonic()
     while wanted:
         if time.monotonic() - began > LIVE_PATIENCE:
             raise SystemExit(f"{', '.join(wanted)} did not come within {LIVE_PATIENCE:.0f} s; try a quieter machine")
         for name, mark in list(wanted.items()):
             if not camera.shows(mark):
                 continue
-            camera.take(name, settle=0.8 if name in ("running", "retry", "learning") else 0.0)
+            camera.take(name, settle)
             if camera.shows(mark):
                 del wanted[name]
-        if "success" in wanted and len(wanted) == 1 and camera.shows("[data-state='RUNNING']"):
-            camera.page.keyboard.press("s")
+        for state, key in keys.items():
+            if camera.shows(f"[data-state='{state}']"):
+                camera.page.keyboard.press(key)
         camera.page.wait_for_timeout(50)
 
 
 def why(browser: Any, recordings: Path) -> None:
     """The twin's recording in the attempt view; the sample session where none was made."""
-    made = sorted(recordings.glob("*/session.json"))
+    made = sorted((recordings / "twin").glob("*/session.json"))
     session = made[-1].parent if made else shutil.copytree(ROOT / "recordings/sample", recordings / "sample")
     with program("replay", str(session), "--port", "0", "--operator", "ada") as (_, url):
         camera = Camera(browser, url)
@@ -177,13 +178,16 @@ def arm(browser: Any, recordings: Path) -> None:
     fake.stdout.readline()
     words = ("run", "--robot", "xarm", "--host", "127.0.0.1:15502", "--policy", "test:wander", "--no-scene3d")
     try:
-        with program(*words, "--port", "0", "--no-rerun", "--recordings", str(recordings)) as (_, url):
+        with program(*words, "--port", "0", "--no-rerun", "--recordings", str(recordings / "arm")) as (_, url):
             camera = Camera(browser, url)
             camera.state("SET THE SCENE")
             camera.take("set_the_scene", settle=2.0)
             camera.page.keyboard.press("n")
             camera.until("#op-state:has-text(' in 3 s'), #op-state:has-text(' in 2 s')")
             camera.take("countdown", settle=0.2)
+            take_what_goes_by(camera, ARM, {"SET THE SCENE": "n", "RUNNING": "s"}, settle=0.0)
+            camera.until("#op-state[data-state='RUNNING'], #op-state[data-state='SET THE SCENE']")
+            camera.page.keyboard.press("n")
             camera.state("RUNNING")
             subprocess.run([*FAR, "fake-xarm", "tell", "error", "31"], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
             camera.state("FAULT")

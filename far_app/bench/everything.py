@@ -25,7 +25,8 @@ from far_app.bench.rows import Row
 from far_app.errors import ConfigError, FarError
 
 BENCHMARKS: dict[str, tuple[str, ...]] = {
-    "infer": (), "render": (), "train": (), "evaluate": (), "start": (), "adapt": (), "loop": ("--seconds", "120"),
+    "infer": (), "render": (), "train": (), "evaluate": (), "start": (), "adapt": (), "page": ("--speed", "150"),
+    "loop": ("--seconds", "120"),
 }  # fmt: skip
 """What runs, in this order, and with which arguments beside --json; last what needs most of the machine."""
 
