@@ -141,6 +141,10 @@ def test_stop_ends_leading_and_only_resume_makes_the_arm_ready_again(arm):
     fake, plant = arm
     plant.guide(True)
     plant.halt()
+    end = time.monotonic() + 3
+    while fake.state()["state"] != 4:
+        assert time.monotonic() < end, "STOP did not reach the controller"
+        time.sleep(0.005)
     assert not fake.lead(10, 0, 0)
     plant.guide(False)
     assert fake.state()["mode"] == 2, "a stopped arm is not made ready by itself"

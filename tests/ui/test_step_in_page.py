@@ -126,7 +126,7 @@ def test_space_stops_while_a_person_steers(tab: Any, source: Stage) -> None:
     live(tab, "Forward").click()
     tab.keyboard.press("Space")
     assert wait_until(lambda: len(source.stops) == 1)
-    assert [word.move for word in source.words] == [Move.FORWARD]
+    assert wait_until(lambda: [word.move for word in source.words] == [Move.FORWARD]), "and presses no focused button"
 
 
 def test_marks_of_an_earlier_attempt_and_a_note_carry_who_and_when(tab: Any, source: Stage) -> None:
