@@ -213,6 +213,7 @@ def _phase(statistics: LoopStatistics, threads: dict[str, float]) -> dict[str, A
     wanted = ("p50", "p99")
     return (
         statistics.summary()
+        | {"stages_ms": statistics.timeline.percentiles()}
         | {
             name: {k: v for k, v in percentiles(values, scale).items() if k in wanted}
             for name, (values, scale) in ages.items()

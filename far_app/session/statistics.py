@@ -90,7 +90,6 @@ class LoopStatistics:
             "late_ms": percentiles(self.late, 1e3),
             "overruns": self.overruns,
             "starved": self.starved,
-            "stages_ms": self.timeline.percentiles(),
         }
 
 
