@@ -15,7 +15,7 @@ def test_a_press_right_after_the_app_began_to_listen_is_not_lost(tmp_path: Path)
     endpoints = Endpoints.in_folder(tmp_path)
     feeds = Feeds(endpoints)
     inboxes: list[IntentInbox] = []
-    begins = threading.Timer(0.15, lambda: inboxes.append(IntentInbox(endpoints.intents)))
+    begins = threading.Timer(0.05, lambda: inboxes.append(IntentInbox(endpoints.intents)))
     try:
         assert not feeds.send(Intent.PAUSE, "nobody"), "dropped, never sent late"
         begins.start()
