@@ -70,6 +70,7 @@ class Nudge:
     by: str = ""
 
 
+@register
 class Source(StrEnum):
     """Where the person's motion comes from."""
 

@@ -93,6 +93,8 @@ def _lower(value: Any) -> Any:
             raise WireError(f"arrays of {array.dtype} do not travel; choose one of {sorted(_DTYPES)}")
         return {"!nd": array.dtype.str, "s": list(array.shape), "b": array.tobytes()}
     if isinstance(value, StrEnum):
+        if _ENUMS.get(kind.__name__) is not kind:
+            raise WireError(f"{kind.__name__} is not registered for the wire")
         return {"!enum": kind.__name__, "v": value.value}
     if isinstance(value, bool | int | float | str | bytes):
         return value

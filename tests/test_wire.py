@@ -1,11 +1,13 @@
 """The wire: what is packed comes back the same, whatever it is made of; what is not ours is refused."""
 
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
 import pytest
 
 from far_app.session_states import Intent, State
+from far_app.take_over import Source, Steering
 from far_app.telemetry import LogLine, LoopHealth, OperatorIntent, Telemetry, TrialRow
 from far_app.types import TICK_STAGES, AdaptationStep, RobotMode, RobotStatus
 from far_app.wire import WireError, pack, unpack
@@ -25,6 +27,7 @@ def snapshot() -> Telemetry:
 
 @pytest.mark.parametrize("message", [
     values.observation(3, 10.0), values.chunk(2, candidates=4), snapshot(),
+    replace(snapshot(), state=State.TAKEN_OVER, steering=Steering(source=Source.DEVICE, ticks=3)),
     replace(values.observation(0, 1.0), images={}), OperatorIntent(intent=Intent.PAUSE, operator="ä"),
 ], ids=lambda m: type(m).__name__)  # fmt: skip
 def test_what_is_packed_comes_back(message):
@@ -35,6 +38,16 @@ def test_numpys_numbers_travel_as_numbers():
     numbers = {"attempts": np.int64(2), "success": np.bool_(True), "seconds": np.float64(4.5)}
     row = unpack(pack(replace(snapshot().history[0], **numbers)))
     assert (type(row.attempts), type(row.success), type(row.seconds)) == (int, bool, float)
+
+
+def test_a_word_that_is_not_registered_is_refused_where_it_is_packed():
+    """Not where it is read: there a whole telemetry would be lost for it."""
+
+    class Unknown(StrEnum):
+        WORD = "word"
+
+    with pytest.raises(WireError, match="Unknown is not registered"):
+        pack(Unknown.WORD)
 
 
 def test_a_kind_that_is_not_registered_is_refused():
