@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import subprocess
 import sys
@@ -13,7 +12,6 @@ from pathlib import Path
 
 from far_app.bench.presser import Press, Presser
 from far_app.cli.stage import Stage
-from far_app.scheduling import MESSAGE_PRIORITY
 from far_app.session.inbox import IntentInbox
 from far_app.session.session import Session
 from far_app.session_states import State
@@ -78,14 +76,6 @@ class Bench:
             program.kill()
             program.wait()
         self.load = []
-
-
-def hasten(fake: FakeXArm) -> None:
-    """The fake controller stands for another machine: this one's load is not to slow it. As far as permitted."""
-    assert fake.pid is not None, "the bench's own"
-    for thread in Path(f"/proc/{fake.pid}/task").iterdir():
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(MESSAGE_PRIORITY))
 
 
 def _stop_while_stuck(bench: Bench) -> None:

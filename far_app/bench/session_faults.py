@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from far_app.bench.fault_table import FAULTS, Bench, Fault, hasten
+from far_app.bench.fault_table import FAULTS, Bench, Fault
 from far_app.bench.presser import Presser
 from far_app.bench.recorded import attempts_in, lacking
 from far_app.bench.servo_trace import servo_trace
@@ -64,7 +64,6 @@ def struck(
 def running(address: str, policy: str, folder: Path, camera: bool) -> Iterator[Bench]:
     """A session under way: headless for want of a page, with this program as its operator."""
     fake = FakeXArm.start(address, PORT)
-    hasten(fake)
     trouble = folder / "trouble"
     run = RunOptions(
         robot="xarm", rig=str(seeing_rig(folder, trouble)) if camera else None, host=f"{address}:{PORT}", policy=policy,

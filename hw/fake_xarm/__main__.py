@@ -17,6 +17,7 @@ import sys
 from collections.abc import Sequence
 
 from far_app.errors import ConfigError, FarError
+from far_app.scheduling import MESSAGE_PRIORITY, real_time_from_here
 from hw.fake_xarm.control import CONTROL_OFFSET, FakeXArm
 from hw.fake_xarm.controller import FakeController
 
@@ -41,6 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f"A fake xArm7 controller at {options.address}:{options.port}; run with  "
         f"far run --robot xarm --host {options.address}:{options.port}\nCtrl-C ends it.", flush=True,
     )  # fmt: skip
+    real_time_from_here(MESSAGE_PRIORITY)  # it stands for another machine: this one's load is not to slow it
     asyncio.run(_serve(FakeController(options.address, options.port, control)))
     return 0
 
