@@ -96,9 +96,7 @@ def twin(browser: Any, recordings: Path) -> None:
         camera = Camera(browser, url)
         camera.until("#op-state:not([data-state='WAITING'])")
         take_what_goes_by(camera, TWIN, {}, settle=0.8)
-        camera.until("#op-state[data-state='RUNNING']")
-        camera.page.keyboard.press("p")
-        camera.state("PAUSED")
+        pause_an_attempt(camera)
         camera.take("paused", settle=2.0)
         camera.page.keyboard.press("t")
         camera.state("TAKEN OVER")
@@ -129,6 +127,18 @@ def twin(browser: Any, recordings: Path) -> None:
         camera.page.wait_for_function(dead, timeout=PATIENCE)
         camera.take("page_lost")
         camera.page.close()
+
+
+def pause_an_attempt(camera: Camera) -> None:
+    """Held within an attempt, not on the way home, where a slow browser's key may arrive."""
+    while True:
+        camera.state("RUNNING")
+        camera.page.keyboard.press("p")
+        camera.state("PAUSED")
+        camera.page.wait_for_timeout(1500)
+        if camera.page.locator("button:has-text('Take over'):not(:disabled)").count():
+            return
+        camera.page.keyboard.press("r")
 
 
 def take_what_goes_by(camera: Camera, marks: dict[str, str], keys: dict[str, str], settle: float) -> None:
