@@ -1,6 +1,6 @@
 """Takes every picture of the pages anew, from real runs in a headless Chromium: python docs/screenshots.py [PART...]
 
-Parts: twin (a session on the twin with the shipped model), why (its recording in the attempt view), arm (the states
+Parts: twin (a session on the twin with the shipped model), why (the sample session in the attempt view), arm (the states
 that only a real arm has, on the fake controller). Writes docs/screens/*.jpg; takes about four minutes on two cores.
 """
 
@@ -163,9 +163,8 @@ def take_what_goes_by(camera: Camera, marks: dict[str, str], keys: dict[str, str
 
 
 def why(browser: Any, recordings: Path) -> None:
-    """The twin's recording in the attempt view; the sample session where none was made."""
-    made = sorted((recordings / "twin").glob("*/session.json"))
-    session = made[-1].parent if made else shutil.copytree(ROOT / "recordings/sample", recordings / "sample")
+    """The session that comes with the program, in the attempt view."""
+    session = shutil.copytree(ROOT / "recordings/sample", recordings / "sample")
     with program("replay", str(session), "--port", "0", "--operator", "ada") as (_, url):
         camera = Camera(browser, url)
         camera.until("#why-numbers tr.sent")
