@@ -1,6 +1,6 @@
 """Takes every picture of the pages anew, from real runs in a headless Chromium: python docs/screenshots.py [PART...]
 
-Parts: twin (a session on the twin with the shipped model), why (the sample session in the attempt view), arm (the states
+Parts: twin (a session on the twin with the shipped model), why (the sample session in the attempt view), arm (states
 that only a real arm has, on the fake controller). Writes docs/screens/*.jpg; takes about four minutes on two cores.
 """
 
