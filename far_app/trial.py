@@ -219,9 +219,7 @@ def execute(
             if chunk.tick < len(steps):  # V(s_k) of an earlier tick, computed in time for the record
                 steps[chunk.tick] = replace(steps[chunk.tick], value=chunk.value)
         asked = person.action(observation)
-        if (
-            asked is None and step is not None and step.intervention
-        ):  # handed back: plans for where the arm was are void
+        if asked is None and step is not None and step.intervention:  # handed back: older plans are void
             plan, since = plan.newest(), 0
             alarm.begin()
         action = asked if asked is not None else plan.action(t)  # â_t = g(chunks)

@@ -32,6 +32,8 @@ class Board:
         self.history = History()
         self._log = deque[LogLine](maxlen=50)
         self._values: list[float] = []
+        self._helped = 0
+        """Ticks of the attempt in which a person had the arm: the horizon stands still meanwhile."""
         self._step: Step | None = None
         self._chunk: ActionChunk | None = None
         self._curve: Adaptation | None = None
@@ -88,6 +90,7 @@ class Board:
         """V of a tick often arrives with a later one; the curve has one entry a tick, NaN where there is none."""
         self._step = step
         self._values.append(step.value)
+        self._helped += step.intervention
 
     def planned(self, chunk: ActionChunk) -> None:
         self._chunk = chunk
@@ -127,7 +130,8 @@ class Board:
             task=self._task.name, method=self._method, policy_version=self.policy_version, engine=self.engine.name,
             engine_refused=self.engine.refused, trial=self.trial, trials=self._trials, attempt=self.attempt,
             max_attempts=self._max_attempts, scene_seed=self.scene_seed,
-            tick=len(self._values), horizon=self._task.horizon, rate=self._task.rate, chunk_horizon=self._chunk_horizon,
+            tick=len(self._values), horizon=self._task.horizon + self._helped,
+            rate=self._task.rate, chunk_horizon=self._chunk_horizon,
             values=np.array(values, dtype=float),
             value_changes=curve.value_changes if curve else np.zeros(0),
             threshold=curve.threshold if curve else float("nan"), flagged=curve.flagged if curve else (),
@@ -151,6 +155,7 @@ class Board:
 
     def _clear(self) -> None:
         self._values = []
+        self._helped = 0
         self._step = self._chunk = self._curve = None
         self.adapting = False
 

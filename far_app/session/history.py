@@ -21,15 +21,22 @@ class History:
         self._attempts: OrderedDict[tuple[int, int], Judged] = OrderedDict()
         self._early: dict[tuple[int, int], list[Mark]] = {}
         """Words on the attempt under way."""
+        self._trials_told: tuple[TrialRow, ...] | None = ()
+        self._attempts_told: tuple[Judged, ...] | None = ()
+        """What the loop hands to the page many times a second; made anew after a change only."""
 
     @property
     def trials(self) -> tuple[TrialRow, ...]:
         """Under the last word on each attempt."""
-        return tuple(self._told(row) for row in self._trials)
+        if self._trials_told is None:
+            self._trials_told = tuple(self._told(row) for row in self._trials)
+        return self._trials_told
 
     @property
     def attempts(self) -> tuple[Judged, ...]:
-        return tuple(self._attempts.values())
+        if self._attempts_told is None:
+            self._attempts_told = tuple(self._attempts.values())
+        return self._attempts_told
 
     def has(self, trial: int, attempt: int) -> bool:
         return (trial, attempt) in self._attempts
@@ -43,6 +50,7 @@ class History:
             trial=trial, attempt=attempt.index, success=outcome.success, judged_by=outcome.judged_by.value,
             policy_version=attempt.policy_version,
         )  # fmt: skip
+        self._changed()
         for mark in self._early.pop(key, []):
             self.marked(mark)
         while len(self._attempts) > ATTEMPTS:
@@ -50,6 +58,7 @@ class History:
 
     def trial_ended(self, row: TrialRow) -> None:
         self._trials.append(row)
+        self._changed()
         self._early.clear()
 
     def marked(self, mark: Mark) -> None:
@@ -61,6 +70,10 @@ class History:
             return
         verdict = mark.verdict if mark.verdict is not None else before.verdict
         self._attempts[key] = replace(before, verdict=verdict, note=mark.note or before.note, by=mark.by or before.by)
+        self._changed()
+
+    def _changed(self) -> None:
+        self._trials_told = self._attempts_told = None
 
     def _told(self, row: TrialRow) -> TrialRow:
         said = [a for a in self._attempts.values() if a.trial == row.trial and a.verdict is not None]

@@ -16,10 +16,13 @@ from far_app.recording.episodes import session_episodes
 from far_app.recording.reader import read_session
 from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
+from far_app.session.history import History
 from far_app.session_report.outcomes import ended_trials
 from far_app.session_states import Intent, State
+from far_app.telemetry import TrialRow
+from far_app.types import Attempt, Judge, Outcome
 from tests.recording import sessions
-from tests.session.kinematic import Forward
+from tests.session.kinematic import Forward, KinematicRobot
 from tests.session.test_session import Desk
 
 
@@ -122,3 +125,21 @@ def test_far_mark_says_what_it_changed_and_refuses_what_is_not_there(tmp_path, c
     with pytest.raises(RecordingError, match="neither"):
         marks.append(path, Mark(trial=1, attempt=1))
     assert trouble(Mark(trial=1, attempt=1, note="fine")) == ""
+
+
+def test_the_history_is_told_anew_after_a_change_and_only_then():
+    history = History()
+    attempt = Attempt(
+        index=1, scene_seed=3, steps=(), final=KinematicRobot().observe(),
+        outcome=Outcome(success=False, judged_by=Judge.HORIZON), policy_version="base",
+    )  # fmt: skip
+    history.attempt_ended(1, attempt)
+    history.trial_ended(
+        TrialRow(trial=1, scene_seed=3, attempts=1, success=False, judged_by="horizon", flagged=0, seconds=1.0, note="")
+    )
+    assert not history.trials[0].success
+    assert history.trials is history.trials and history.attempts is history.attempts, "the loop asks at every snapshot"
+    history.marked(Mark(trial=1, attempt=1, verdict=Verdict.SUCCESS, by="ada"))
+    assert history.trials[0].success and history.attempts[0].verdict is Verdict.SUCCESS
+    history.attempt_ended(2, attempt)
+    assert len(history.attempts) == 2

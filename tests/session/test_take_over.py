@@ -104,6 +104,8 @@ def test_a_person_takes_over_moves_the_arm_and_hands_back_without_a_jump():
     first, last = np.flatnonzero(theirs)[[0, -1]]
     assert theirs[first : last + 1].all(), "one stretch of ticks is labelled"
     assert sum(not s.intervention for s in steps) == 60, "the horizon counts the policy's ticks alone"
+    shown = desk.session.board.telemetry(State.FINISHED, None)
+    assert shown.tick == shown.horizon == len(steps), "and the page shows both"
 
     way = np.diff([t.pose.position for t in desk.robot.targets], axis=0)
     moved = np.linalg.norm(way, axis=1)
