@@ -57,10 +57,8 @@ def on_this_robot(options: RunOptions, retry: RetryConfig) -> RetryConfig:
 
 def told(result: TrialResult) -> dict[str, Any]:
     """A trial in the summary; that it does not count is said where it does not."""
-    fields = dataclasses.asdict(result)
-    if result.counted:
-        del fields["counted"]
-    return fields
+    fields = {name: getattr(result, name) for name in ("seed", "attempts", "success", "judged_by")}
+    return fields if result.counted else {**fields, "counted": False}
 
 
 def run(options: RunOptions) -> tuple[list[TrialResult], LoopStatistics]:
