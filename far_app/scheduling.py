@@ -99,6 +99,18 @@ def _schedule(priority: int, inherited: bool) -> bool:
     try:
         policy = os.SCHED_FIFO | (0 if inherited else os.SCHED_RESET_ON_FORK)
         os.sched_setscheduler(threading.get_native_id(), policy, os.sched_param(priority))
+        if inherited:
+            _remember(priority)
     except (OSError, AttributeError):
         return False
     return True
+
+
+def _remember(priority: int) -> None:
+    """Tell the C library too. It keeps its own note of a thread's scheduling once anybody asked for it, hands the note
+    to the threads started from there, and libzmq's threads begin by setting what the note says: a stale one, made by
+    any library in the process, would take from them what the kernel let them inherit."""
+    c = ctypes.CDLL(None)
+    c.pthread_self.restype = ctypes.c_ulong
+    c.pthread_setschedparam.argtypes = [ctypes.c_ulong, ctypes.c_int, ctypes.POINTER(ctypes.c_int)]
+    c.pthread_setschedparam(c.pthread_self(), os.SCHED_FIFO, ctypes.byref(ctypes.c_int(priority)))

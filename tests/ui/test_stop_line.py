@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import threading
 import time
@@ -25,6 +26,14 @@ def policies() -> dict[int, int]:
     }
 
 
+def note_of_the_scheduling() -> None:
+    """Asks the C library how this thread is scheduled: from then on the threads started here take its answer along."""
+    c = ctypes.CDLL(None)
+    c.pthread_self.restype = ctypes.c_ulong
+    policy, priority = ctypes.c_int(), ctypes.c_int()
+    assert c.pthread_getschedparam(ctypes.c_ulong(c.pthread_self()), ctypes.byref(policy), ctypes.byref(priority)) == 0
+
+
 def test_no_thread_of_the_line_waits_for_a_core_behind_other_programs(folder: Path, stage: Stage) -> None:
     granted: list[str] = []
     asking = threading.Thread(target=lambda: granted.append(real_time(1)))
@@ -32,6 +41,7 @@ def test_no_thread_of_the_line_waits_for_a_core_behind_other_programs(folder: Pa
     asking.join()
     if granted != ["fifo"]:
         pytest.skip("real time is not permitted here")
+    note_of_the_scheduling()  # as a library in the page's process may have done
     before = policies()
     line = StopLine(Endpoints.in_folder(folder))
     line.press("test")
