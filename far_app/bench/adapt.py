@@ -1,18 +1,18 @@
 """`far bench adapt`: seconds from a failed attempt to a new policy version, by stage, with the 30 Hz loop running.
 
-Naive trials go on in the twin all along; meanwhile one failed attempt is learnt from again and again, in the background
-thread a session would use: in the fast form and in the plain one, which take turns. Then adaptations are cancelled at
-moments spread over their course. `homing` is what the same machine needs to take the arm home: the time there is.
-`growth` (far_app/bench/adapt_growth.py) is measured without a loop.
+First naive trials, until one has failed. Then a session in the twin as any other, whose short attempts all fail: while
+the arm goes home (and waits there) that one failure is learnt from again and again, in the session's background thread,
+in the fast form and in the plain one, which take turns. Then adaptations are cancelled at moments spread over their
+course. `homing` is what the naive trials needed to take the arm home: the time there is. `growth`
+(far_app/bench/adapt_growth.py) is measured without a loop.
 """
 
 from __future__ import annotations
 
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +20,24 @@ import numpy as np
 import tyro
 
 from far_app.bench.adapt_growth import growth
-from far_app.bench.loop import Unlearning, naive_session
+from far_app.bench.loop import naive_session
 from far_app.bench.report import write
 from far_app.cli.options import RunOptions
 from far_app.cli.settings import recommended
 from far_app.cli.stage import stage
 from far_app.errors import ConfigError, FarError
-from far_app.protocols import Method
-from far_app.session.adaptation import BackgroundAdaptation
+from far_app.learning.cancellation import Cancelled
+from far_app.protocols import Method, Policy, Progress
+from far_app.session.adaptation import unchanged
 from far_app.session.inbox import IntentInbox
 from far_app.session.statistics import LoopStatistics, percentiles
 from far_app.session_states import Intent
 from far_app.types import Adaptation, Attempt
+
+ATTEMPTS, SHORT = 5, 20
+"""Of a trial whose attempts all fail, and the ticks of one: the failure that is learnt from has its own."""
+PATIENCE = 600.0
+"""Seconds after which a session would go on without an adaptation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,49 +93,77 @@ def main(arguments: Sequence[str]) -> int:
 
 def measure(options: AdaptOptions) -> dict[str, Any]:
     """{"ticks", "forms": a row each, "speedup", "cancel_ms", "homing", "growth": rows}."""
-    forms = {"fast": Measured(), "plain": Measured()}
-    late: list[float] = []
     with tempfile.TemporaryDirectory(prefix="far-bench-") as recordings:
         run = RunOptions(
             seed=options.seed, policy=options.policy, critic=options.critic, method="far", headless=True, rerun=False,
-            torch_threads=options.torch_threads, recordings=Path(recordings),
-            retry=recommended(RunOptions.task, options.policy),
+            torch_threads=options.torch_threads, recordings=Path(recordings), max_attempts=ATTEMPTS, trials=1000,
+            retry=replace(recommended(RunOptions.task, options.policy), adaptation_limit=PATIENCE),
         )  # fmt: skip
         with stage(run) as stage_:
-            methods = {"fast": stage_.parts.method, "plain": plainly(stage_.parts.another())}
-            _, failure, _ = naive_session(stage_, options.attempt_seconds)
-            inbox, statistics = IntentInbox(), LoopStatistics()
-            ended = threading.Event()
-
-            def learn() -> None:
-                try:
-                    for form in turns(options.rounds, options.plain_rounds):
-                        once(methods[form], failure, ended, forms[form])
-                    typical = float(np.median(forms["fast"].seconds))
-                    for i in range(options.cancels):
-                        after = typical * (i + 0.5) / options.cancels
-                        late.extend(cancelled(methods["fast"], failure, ended, after))
-                finally:
-                    inbox.put(Intent.QUIT)
-
-            learning = threading.Thread(target=learn, name="bench-learning", daemon=True)
-            unlearning = Unlearning(stage_.parts.method)
-            with stage_.session(stage_.writer(), inbox, statistics, method=unlearning) as session:
-                learning.start()
-                try:
-                    session.run()
-                finally:
-                    ended.set()
-                    learning.join()
-    if not forms["fast"].seconds:
+            statistics, failure, _ = naive_session(stage_, options.attempt_seconds)
+            inbox = IntentInbox()
+            forms = {"fast": stage_.parts.method, "plain": plainly(stage_.parts.another())}
+            taught = Taught(forms, failure, options, ended=lambda: inbox.put(Intent.QUIT))
+            doomed = replace(stage_, task=replace(stage_.task, judge="person", horizon=SHORT))
+            with doomed.session(doomed.writer(), inbox, LoopStatistics(), method=taught) as session:
+                session.run()
+    rows = [measured.row(form) for form, measured in taught.measured.items() if measured.seconds]
+    if not rows:
         raise FarError("the session ended before an adaptation was done; measure again")
-    rows = [measured.row(form) for form, measured in forms.items() if measured.seconds]
     return {
         "ticks": len(failure.steps), "forms": rows,
         "speedup": rows[1]["seconds"]["p50"] / rows[0]["seconds"]["p50"] if len(rows) > 1 else None,
-        "cancel_ms": percentiles(late, 1e3), "homing": percentiles(statistics.homing),
+        "cancel_ms": percentiles(taught.late, 1e3), "homing": percentiles(statistics.homing),
         "growth": growth(options.growth) if options.growth else [],
     }  # fmt: skip
+
+
+class Taught:
+    """A method that learns from one failure again and again, whatever failed: in the fast form, in the plain one, or
+    until it is cancelled. Its trials never leave the base policy behind for long."""
+
+    name = "far"
+
+    def __init__(
+        self, forms: Mapping[str, Method], failure: Attempt, options: AdaptOptions, ended: Callable[[], None]
+    ) -> None:
+        self.forms, self.failure, self.ended = forms, failure, ended
+        self.turns = iter([*turns(options.rounds, options.plain_rounds), *["cancelled"] * options.cancels])
+        self.cancels = options.cancels
+        self.measured = {form: Measured() for form in forms}
+        self.late: list[float] = []
+        """Seconds from each cancellation until it was heeded."""
+        self.perturb = forms["fast"].perturb
+        self._cancelled = 0
+
+    @property
+    def policy(self) -> Policy:
+        return self.forms["fast"].policy
+
+    def begin(self, scene_seed: int) -> None:
+        self.forms["fast"].begin(scene_seed)
+
+    def adapt(self, attempt: Attempt, cancelled: Cancelled, progress: Progress) -> Adaptation:
+        turn = next(self.turns, "")
+        if not turn:
+            self.ended()
+            return unchanged(self.policy.version, "none")
+        method = self.forms["plain" if turn == "plain" else "fast"]
+        method.begin(attempt.scene_seed)
+        began = time.monotonic()
+        if turn == "cancelled":
+            typical = float(np.median(self.measured["fast"].seconds))
+            moment = began + typical * (self._cancelled + 0.5) / self.cancels
+            self._cancelled += 1
+            adaptation = method.adapt(self.failure, lambda: cancelled() or time.monotonic() > moment, progress)
+            if adaptation.status == "cancelled":
+                self.late.append(time.monotonic() - moment)
+            return adaptation
+        adaptation = method.adapt(self.failure, cancelled, progress)
+        if adaptation.status != "cancelled":
+            self.measured[turn].seconds.append(time.monotonic() - began)
+            self.measured[turn].adaptations.append(adaptation)
+        return adaptation
 
 
 def turns(fast: int, plain: int) -> list[str]:
@@ -146,33 +180,3 @@ def plainly(method: Method) -> Method:
     assert isinstance(method, RetryMethod), "the benchmark's method learns"
     method.arrange = plain
     return method
-
-
-def once(method: Method, failure: Attempt, ended: threading.Event, into: Measured) -> None:
-    """One adaptation from beginning to end, unless the session ends first."""
-    began, adaptation = begun(method, failure)
-    wait(lambda: adaptation.done() or ended.is_set())
-    if ended.is_set():
-        return adaptation.cancel(wait=True)
-    into.seconds.append(time.monotonic() - began)
-    into.adaptations.append(adaptation.result())
-    return None
-
-
-def cancelled(method: Method, failure: Attempt, ended: threading.Event, after: float) -> list[float]:
-    """Seconds from a cancellation to the thread's end; nothing when the adaptation was over before."""
-    began, adaptation = begun(method, failure)
-    wait(lambda: time.monotonic() > began + after or not adaptation.running or ended.is_set())
-    was_running, asked = adaptation.running, time.monotonic()
-    adaptation.cancel(wait=True)
-    return [time.monotonic() - asked] if was_running else []
-
-
-def begun(method: Method, failure: Attempt) -> tuple[float, BackgroundAdaptation]:
-    method.begin(failure.scene_seed)
-    return time.monotonic(), BackgroundAdaptation(method, failure, limit=600.0)
-
-
-def wait(until: Callable[[], bool]) -> None:
-    while not until():
-        time.sleep(0.005)

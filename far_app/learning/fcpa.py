@@ -25,7 +25,7 @@ from far_app.learning.preference import Demonstrations, Noising, Objective, draw
 from far_app.learning.trainable import Arrange, trainable
 from far_app.types import AdaptationStep
 
-FIXED_DRAWS = 2
+FIXED_DRAWS = 1
 """Draws a state for the reported l⁺ and l⁻; the same before the first and after every step."""
 
 

@@ -21,12 +21,14 @@ from torch.nn import functional
 
 from far_app.config import FCPAConfig
 from far_app.learning.cancellation import Cancelled, check
-from far_app.learning.pairs import BATCH, Pairs
+from far_app.learning.pairs import Pairs
 from far_app.learning.trainable import Trainable
 from far_app.types import ARM_DIMS
 
 AddNoise = Callable[[Float[Tensor, "B H A"], Float[Tensor, "B H A"], Int[Tensor, "B"]], Float[Tensor, "B H A"]]
 """a_k from (a, ε, k)."""
+BATCH = 128
+"""Rows a pass: enough to be quick, few enough that a cancellation between two is noticed within 100 ms."""
 STATES_AT_ONCE = 16
 """States whose activations are kept for one backward pass; bounds memory, not the result."""
 BC_BATCH = 64
@@ -93,6 +95,8 @@ def denoising_errors(
         check(cancelled)
         here, row = state[rows].unique(return_inverse=True)
         predicted = denoiser.run(noisy[rows], k[rows], denoiser.condition(features[here])[row])
+        if predicted.requires_grad:
+            predicted.register_hook(lambda _: check(cancelled))  # on the way back too, batch by batch
         squared = (noise[rows] - predicted)[..., :dims].square().flatten(1)
         errors.append(squared.sum(1) if config.reduction == "sum" else squared.mean(1))
     return errors
@@ -191,12 +195,14 @@ class Objective:
             )
 
     def accumulate(self, totals: list[Tensor], errors: list[Tensor], share: Float[Tensor, "N"], draws: int) -> None:
-        """Add the gradients of Σ share · l_diff, batch by batch."""
-        for error, weight in zip(errors, (share / draws).repeat_interleave(draws).split(BATCH), strict=False):
-            check(self.cancelled)
-            gradients = torch.autograd.grad((error * weight).sum(), self.denoiser.leaves, materialize_grads=True)
-            for total, gradient in zip(totals, gradients, strict=True):
-                total.add_(gradient)
+        """Add the gradients of Σ share · l_diff."""
+        if not errors:
+            return
+        check(self.cancelled)
+        weights = (share / draws).repeat_interleave(draws).split([len(e) for e in errors])
+        gradients = torch.autograd.grad(errors, self.denoiser.leaves, weights, materialize_grads=True)
+        for total, gradient in zip(totals, gradients, strict=True):
+            total.add_(gradient)
 
     def cloning_gradient(self, demonstrations: Demonstrations, rng: np.random.Generator) -> Float[Tensor, "P"]:
         """Gradient of the behaviour-cloning loss on a minibatch of demonstration chunks."""

@@ -17,7 +17,7 @@ from far_app.session.publisher import RATE, TelemetryPublisher
 from far_app.session.recorder import Recorder
 from far_app.session.watched import WatchedRobot
 from far_app.session_states import Event, Happening, Intent, State, allowed, refusal, step
-from far_app.types import Judge, Outcome
+from far_app.types import Judge, Outcome, RobotMode
 
 log = logging.getLogger(__name__)
 
@@ -61,11 +61,18 @@ class Standing:
         why = refusal(self.state, intent)
         if not why and self.withheld.get(intent):
             return f"'{intent}' is refused: {self.withheld[intent]}"
+        if not why and intent is Intent.RESUME and self.state in (State.HOMING, State.ADAPTING) and not self._asked():
+            return f"'{intent}' is refused: the arm goes home by itself"
         if why or intent is not Intent.TAKE_OVER:
             return why
         if self.phase not in ("attempt", "judging"):
             return f"'{intent}' is refused while the arm goes home: only an attempt can be taken over"
         return ""
+
+    def _asked(self) -> bool:
+        """The way home waits for the operator to take what the hand holds."""
+        newest = self.robot.newest
+        return newest is not None and newest.status.mode is RobotMode.HOMING and bool(newest.status.reason)
 
     def allowed(self) -> tuple[Intent, ...]:
         """The intents that apply now."""

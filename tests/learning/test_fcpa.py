@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from far_app.config import FCPAConfig
 from far_app.errors import ConfigError
-from far_app.learning import diffusion, fcpa
+from far_app.learning import diffusion, fcpa, preference
 from far_app.learning.cancellation import AdaptationCancelledError, never
 from far_app.learning.fast_unet import FastUnet
 from far_app.learning.pairs import Pairs
@@ -276,15 +276,15 @@ def test_cancellation_ends_it_between_two_passes():
     assert len(looks) == 7
 
 
-def test_it_looks_for_cancellation_before_every_batch_of_at_most_64(monkeypatch):
-    looks, rows = [], []
+def test_it_looks_for_cancellation_before_and_behind_every_small_batch(monkeypatch):
+    looks, rows, learnt_from = [], [], []
     run_ = FastUnet.run
 
     def counting(self, noisy, k, condition):
-        rows.append(len(noisy))
+        (learnt_from if torch.is_grad_enabled() else rows).append(len(noisy))
         return run_(self, noisy, k, condition)
 
     monkeypatch.setattr(FastUnet, "run", counting)
     run(FCPAConfig(steps=2), some_pairs(states=20, positives=8), cancelled=lambda: bool(looks.append(1)))
-    assert max(rows) <= 64
-    assert len(looks) > len(rows)
+    assert max(rows + learnt_from) <= preference.BATCH
+    assert len(looks) >= len(rows) + 2 * len(learnt_from)

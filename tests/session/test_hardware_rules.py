@@ -126,6 +126,7 @@ def test_a_way_home_that_asks_is_shown_and_answered_by_resume():
     desk = Desk(robot=KinematicRobot(homing_ticks=10**6), headless=False)
     thread = started(desk)
     eventually(lambda: desk.state is State.HOMING, "it goes home")
+    assert Intent.RESUME not in desk.session.standing.allowed(), "nothing waits for an answer yet"
     desk.robot.status = replace(desk.robot.status, reason="take what the hand holds, then resume")
     eventually(lambda: "take what the hand holds" in desk.session.board.reason, "the page says what is waited for")
     desk.inbox.put(Intent.RESUME)
