@@ -57,12 +57,13 @@ class FlatAdamW:
         """⟨g⁺, Δθ⟩ of the step that g⁺ + share · g⁻ would make; nothing is changed."""
         b1, b2 = self.betas
         m, v, steps = self.moments()
+        grown = 1 - b2 ** (steps + 1)
         total = 0.0
         for winner, loser, m_, v_ in zip(*(x.split(PIECE) for x in (g_winner, g_loser, m, v)), strict=True):
             gradient = torch.add(winner, loser, alpha=share)
-            scale = (b2 * v_).addcmul_(gradient, gradient, value=1 - b2).div_(1 - b2 ** (steps + 1)).sqrt_()
-            change = (b1 * m_).add_(gradient, alpha=1 - b1).div_(scale.add_(self.eps))
-            total += float(winner @ change)
+            change = torch.lerp(gradient, m_, b1)
+            scale = (v_ * (b2 / grown)).addcmul_(gradient, gradient, value=(1 - b2) / grown).sqrt_().add_(self.eps)
+            total += float(winner @ change.div_(scale))
         return -self.lr / (1 - b1 ** (steps + 1)) * total
 
 

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
+from concurrent.futures import Future
+from typing import TypeVar
+
+T = TypeVar("T")
 
 Cancelled = Callable[[], bool]
 """True once nobody waits for the result any more."""
@@ -16,6 +21,31 @@ def check(cancelled: Cancelled) -> None:
     """Raise when the adaptation is no longer wanted. Called between batches, some 20 ms apart."""
     if cancelled():
         raise AdaptationCancelledError
+
+
+def abandonable(call: Callable[[], T], cancelled: Cancelled) -> T:
+    """The result of a call that cannot look for itself (a compiler's); when the adaptation is no longer wanted it is
+    left to end alone, in its own thread, and its result is dropped."""
+    result: Future[T] = Future()
+
+    def work() -> None:
+        try:
+            result.set_result(call())
+        except BaseException as error:
+            result.set_exception(error)
+
+    threading.Thread(target=work, name="adaptation-engine", daemon=True).start()
+    while True:
+        try:
+            return result.result(timeout=_LOOK)
+        except TimeoutError:
+            if result.done():
+                raise
+            check(cancelled)
+
+
+_LOOK = 0.02
+"""Seconds between two looks."""
 
 
 def never() -> bool:

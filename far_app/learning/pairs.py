@@ -22,7 +22,7 @@ from far_app.config import PairsConfig
 from far_app.learning.cancellation import Cancelled, check
 from far_app.types import ARM_DIMS, TRANSLATION_DIMS
 
-BATCH = 64
+BATCH = 128
 """Chunks a pass; small enough that a cancellation is noticed within a few tens of milliseconds."""
 
 Sampler = Callable[[Float[Tensor, "B F"], Float[Tensor, "B H A"]], Float[Tensor, "B H A"]]

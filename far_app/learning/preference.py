@@ -27,7 +27,7 @@ from far_app.types import ARM_DIMS
 
 AddNoise = Callable[[Float[Tensor, "B H A"], Float[Tensor, "B H A"], Int[Tensor, "B"]], Float[Tensor, "B H A"]]
 """a_k from (a, ε, k)."""
-BATCH = 128
+BATCH = 256
 """Rows a pass: enough to be quick, few enough that a cancellation between two is noticed within 100 ms."""
 STATES_AT_ONCE = 16
 """States whose activations are kept for one backward pass; bounds memory, not the result."""
@@ -147,12 +147,14 @@ class Objective:
     def report(self, draws: Draws) -> tuple[float, float, float]:
         """(loss, l⁺, l⁻), each a mean over pairs, on these draws."""
         pairs, count = self.pairs, draws.k.shape[1]
-        everything = slice(0, len(pairs.features))
-        winner = per_chunk(self.errors(pairs.positives, pairs.owner, everything, draws), count)
-        loser = torch.full_like(winner, math.nan)
+        chunks, owner = pairs.positives, pairs.owner
         if self.config.objective != "awr":
-            own = torch.arange(len(pairs.negatives))
-            loser = per_chunk(self.errors(pairs.negatives, own, everything, draws), count)[pairs.owner]
+            chunks = torch.cat([chunks, pairs.negatives])
+            owner = torch.cat([owner, torch.arange(len(pairs.negatives), device=owner.device)])
+        errors = per_chunk(self.errors(chunks, owner, slice(0, len(pairs.features)), draws), count)
+        winner, loser = errors[: len(pairs)], torch.full_like(errors[: len(pairs)], math.nan)
+        if self.config.objective != "awr":
+            loser = errors[len(pairs) :][pairs.owner]
         loss = preference_loss(winner, loser, self.config, pairs.weights) / len(pairs)
         return float(loss), float(winner.mean()), float(loser.mean())
 

@@ -21,7 +21,7 @@ from far_app.config import RetryConfig
 from far_app.errors import ConfigError, FarError
 from far_app.learning import diffusion, fcpa
 from far_app.learning.adapted import denoiser_of
-from far_app.learning.cancellation import AdaptationCancelledError, Cancelled, check
+from far_app.learning.cancellation import AdaptationCancelledError, Cancelled, abandonable, check
 from far_app.learning.critic import Critic
 from far_app.learning.memory import FeatureMemory
 from far_app.learning.pairs import Pairs, candidates, explored, merged, select, weighted_trajectory
@@ -162,7 +162,8 @@ class RetryMethod:
     def _become(self, denoiser: nn.Module, pairs: Pairs, outdated: Cancelled) -> None:
         """Swap the acting policy, unless a new trial began or nobody waits any more."""
         network = with_denoiser(self.base, denoiser)
-        policy = self._act(network, f"{BASE_VERSION}+a{self._adaptations + 1}")
+        version = f"{BASE_VERSION}+a{self._adaptations + 1}"
+        policy = abandonable(lambda: self._act(network, version), outdated)
         self._fingerprint = self._fingerprint or fingerprint(self._first)
         parent = self.policy if self.config.fcpa.accumulate else self._base_policy
         weights = AdaptedWeights(
