@@ -20,51 +20,51 @@ from far_app.errors import PolicyError
 BISECTIONS = 5
 """λ is found to within 1/32."""
 PIECE = 2**16
-"""Elements looked at together by `slope`, so that its dozen operations stay in the cache."""
+"""Elements gone through together, so that what several operations touch stays in the cache."""
 
 
 class FlatAdamW:
-    """torch's fused AdamW over one flat tensor, `weights`, of which the given parameters become views."""
+    """AdamW without weight decay over one flat tensor, `weights`, of which the given parameters become views.
 
-    def __init__(self, parameters: Sequence[Tensor], lr: float) -> None:
+    Not torch.optim's: the first optimiser that a process makes imports a compiler, for a second and a half in which it
+    holds the interpreter a tenth of a second at a time, and the control loop waits."""
+
+    def __init__(
+        self, parameters: Sequence[Tensor], lr: float, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-8
+    ) -> None:
         self.weights = torch.cat([p.detach().flatten() for p in parameters])
         for p, part in zip(parameters, self.weights.split([p.numel() for p in parameters]), strict=True):
             p.data = part.view(p.shape)
-        self._torch = torch.optim.AdamW([self.weights], lr=lr, weight_decay=0.0, fused=True)
-        self.lr = lr
-        self.betas: tuple[float, float] = self._torch.defaults["betas"]
-        self.eps: float = self._torch.defaults["eps"]
-
-    def moments(self) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"], int]:
-        """(m, v, steps taken)."""
-        state = self._torch.state[self.weights]
-        if not state:
-            zeros = torch.zeros_like(self.weights)
-            return zeros, zeros, 0
-        return state["exp_avg"], state["exp_avg_sq"], int(state["step"])
+        self.lr, self.betas, self.eps = lr, betas, eps
+        self.m, self.v = torch.zeros_like(self.weights), torch.zeros_like(self.weights)
+        self.steps = 0
 
     def forget_momentum(self) -> None:
-        self.moments()[0].zero_()
+        self.m.zero_()
 
     def step(self, gradient: Float[Tensor, "P"]) -> None:
         """Take the step. Raises PolicyError when the gradient is not finite; nothing is changed then."""
         if not bool(torch.isfinite(gradient.sum())):
             raise PolicyError("the gradient of the adaptation is not finite; lower fcpa.lr")
-        self.weights.grad = gradient
-        self._torch.step()
+        self.steps += 1
+        b1, b2 = self.betas
+        rate, grown = self.lr / (1 - b1**self.steps), 1 - b2**self.steps
+        for weights, m, v, g in zip(*(x.split(PIECE) for x in (self.weights, self.m, self.v, gradient)), strict=True):
+            m.lerp_(g, 1 - b1)
+            v.mul_(b2).addcmul_(g, g, value=1 - b2)
+            weights.addcdiv_(m, (v / grown).sqrt_().add_(self.eps), value=-rate)
 
     def slope(self, g_winner: Float[Tensor, "P"], g_loser: Float[Tensor, "P"], share: float) -> float:
         """⟨g⁺, Δθ⟩ of the step that g⁺ + share · g⁻ would make; nothing is changed."""
         b1, b2 = self.betas
-        m, v, steps = self.moments()
-        grown = 1 - b2 ** (steps + 1)
+        grown = 1 - b2 ** (self.steps + 1)
         total = 0.0
-        for winner, loser, m_, v_ in zip(*(x.split(PIECE) for x in (g_winner, g_loser, m, v)), strict=True):
+        for winner, loser, m_, v_ in zip(*(x.split(PIECE) for x in (g_winner, g_loser, self.m, self.v)), strict=True):
             gradient = torch.add(winner, loser, alpha=share)
             change = torch.lerp(gradient, m_, b1)
             scale = (v_ * (b2 / grown)).addcmul_(gradient, gradient, value=(1 - b2) / grown).sqrt_().add_(self.eps)
             total += float(winner @ change.div_(scale))
-        return -self.lr / (1 - b1 ** (steps + 1)) * total
+        return -self.lr / (1 - b1 ** (self.steps + 1)) * total
 
 
 def guarded_step(optimiser: FlatAdamW, g_winner: Float[Tensor, "P"], g_loser: Float[Tensor, "P"]) -> float:

@@ -138,9 +138,9 @@ class FastUnet:
 
     def pull_back(self, gradients: Sequence[Tensor]) -> Float[Tensor, "P"]:
         """The gradient on the module's weights, flat, from the gradients on `leaves`. Once for each refresh."""
-        found = torch.autograd.grad(
-            self._arranged, self.parameters, list(gradients), retain_graph=True, materialize_grads=True
-        )
+        # Of a scalar: given `grad_outputs` autograd first imports a compiler (see FlatAdamW).
+        along = torch.stack([(m * g).sum() for m, g in zip(self._arranged, gradients, strict=True)]).sum()
+        found = torch.autograd.grad(along, self.parameters, retain_graph=True, materialize_grads=True)
         return torch.cat([g.flatten() for g in found])
 
     def _blocks(self) -> list[Any]:

@@ -202,7 +202,8 @@ class Objective:
             return
         check(self.cancelled)
         weights = (share / draws).repeat_interleave(draws).split([len(e) for e in errors])
-        gradients = torch.autograd.grad(errors, self.denoiser.leaves, weights, materialize_grads=True)
+        weighted = torch.stack([error @ weight for error, weight in zip(errors, weights, strict=True)]).sum()
+        gradients = torch.autograd.grad(weighted, self.denoiser.leaves, materialize_grads=True)
         for total, gradient in zip(totals, gradients, strict=True):
             total.add_(gradient)
 
