@@ -76,7 +76,7 @@ class Presses:
         self._presence, self._wire = presence, server._websock_server
         self._actions: dict[str, tuple[Callable[[int], None], bool, str]] = {}
         self._values: dict[str, tuple[viser.GuiSliderHandle[Any], Callable[[float], None]]] = {}
-        self._texts: dict[str, tuple[Callable[[str], None], int]] = {}
+        self._texts: dict[str, tuple[viser.GuiInputHandle[str], Callable[[str], None], int]] = {}
         self.refused: Callable[[str, str], None] = lambda what, why: None
         """Told of each press that was refused for want of control: its label, and why."""
         for kind in list(self._wire._incoming_handlers):
@@ -101,8 +101,8 @@ class Presses:
         self._values[handle._impl.uuid] = (handle, action)
 
     def on_text(self, handle: viser.GuiInputHandle[str], write: Callable[[str], None], limit: int) -> None:
-        """A text field; `write` gets what it holds, at most `limit` characters."""
-        self._texts[handle._impl.uuid] = (write, limit)
+        """A text field; `write` gets what it holds, in one line of at most `limit` characters."""
+        self._texts[handle._impl.uuid] = (handle, write, limit)
 
     def _click(self, client: int, message: messages.GuiUpdateMessage) -> None:
         if message.uuid in self._values and set(message.updates) == {"value"}:
@@ -128,9 +128,10 @@ class Presses:
             move(float(min(max(value, handle.min), handle.max)))
 
     def _type(self, client: int, uuid: str, value: object) -> None:
-        write, limit = self._texts[uuid]
-        if isinstance(value, str) and value.isprintable() and self._may(client, False, "a text field"):
-            write(value[:limit])
+        handle, write, limit = self._texts[uuid]
+        if isinstance(value, str) and self._may(client, False, "a text field"):
+            handle._impl.value = value  # as the browser shows it: emptying the field is a change then, and is sent
+            write("".join(c if c.isprintable() else " " for c in value[:limit]))
 
     def _may(self, client: int, everyone: bool, label: str) -> bool:
         if everyone or self._presence.holds(self._wire._live_connections.get(client)):

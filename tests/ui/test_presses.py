@@ -28,9 +28,11 @@ class Served:
         self.button = self.server.gui.add_button("Act")
         self.common = self.server.gui.add_button("Help")
         self.slider = self.server.gui.add_slider("H", min=1, max=32, step=1, initial_value=8)
+        self.field = self.server.gui.add_text("note", "")
         presses.on(self.button, lambda: self.did.append("acted"))
         presses.on(self.common, lambda: self.did.append("helped"), everyone=True)
         presses.on_value(self.slider, self.did.append)
+        presses.on_text(self.field, self.did.append, 12)
 
 
 @pytest.fixture
@@ -51,6 +53,19 @@ def test_a_slider_takes_finite_numbers_and_keeps_them_within_its_limits(served: 
     assert wait_until(lambda: len(served.did) >= 3)
     client.read(0.3)
     assert served.did == [12.0, 32.0, 1.0]
+    client.close()
+
+
+def test_a_text_field_gives_one_line_within_its_limit_and_can_be_emptied(served: Served) -> None:
+    client = RawClient(served.url)
+    assert client.read(5, lambda: served.field._impl.uuid in client.widgets)
+    for value in ("fell down", "a\tb\nc", "x" * 40, 3, None):
+        client.send({"type": "GuiUpdateMessage", "uuid": served.field._impl.uuid, "updates": {"value": value}})
+    assert wait_until(lambda: len(served.did) == 3)
+    client.read(0.3)
+    assert served.did == ["fell down", "a b c", "x" * 12]
+    served.field.value = ""
+    assert client.read(5, lambda: client.widgets[served.field._impl.uuid].get("value") == ""), "the browser is told"
     client.close()
 
 

@@ -19,6 +19,7 @@ from far_app.lineage import Versions, VersionWish, Wish
 from far_app.marks import Verdict
 from far_app.session_states import Intent, State, allowed
 from far_app.take_over import Move, Steering
+from far_app.types import RobotMode
 from ui.keys import Page, key_of
 from ui.take_over import _PAD
 
@@ -148,6 +149,28 @@ def test_marks_of_an_earlier_attempt_and_a_note_carry_who_and_when(tab: Any, sou
     assert (note.trial, note.verdict, note.note) == (2, None, "fell down afterwards")
     assert all(word.mark.by and word.mark.wall for word in source.words)
     live(tab, "Later").click()
+
+
+def test_a_space_in_a_note_is_written_and_stops_nothing_and_stop_is_a_click_away(tab: Any, source: Stage) -> None:
+    source.stops.clear()
+    source.mode = RobotMode.TRACKING
+    tab.wait_for_selector("#op-stop:has-text('space key')")
+    tab.click("#far-tab-marks summary")
+    field = tab.locator("div:has(> .mark-note) + div input")
+    said = "getComputedStyle(document.querySelector('#op-stop'), '::after').content"
+    assert tab.evaluate(said) == "none"
+    field.click()
+    assert "click STOP" in tab.evaluate(said), "the hint that names the space key gives way"
+    tab.keyboard.type("it fell ")
+    button(tab, "STOP").click()
+    assert wait_until(lambda: [stop.source for stop in source.stops] == ["page: button"]), "the spaces pressed nothing"
+    assert field.input_value() == "it fell "
+    live(tab, "Keep note").click()
+    assert wait_until(lambda: [word.mark.note for word in source.words] == ["it fell"])
+    tab.wait_for_function("() => document.querySelector('div:has(> .mark-note) + div input').value === ''")
+    tab.evaluate("document.activeElement.blur()")
+    tab.keyboard.press("Space")
+    assert wait_until(lambda: len(source.stops) == 2), "outside the field it is STOP again"
 
 
 def test_versions_are_undone_restored_and_kept(tab: Any, source: Stage) -> None:
