@@ -179,6 +179,11 @@ def why(browser: Any, recordings: Path) -> None:
         camera.take("why_adapted", settle=2.0)
         camera.page.set_viewport_size({"width": 768, "height": 1024})
         camera.take("why_tablet", settle=2.0)
+        camera.page.set_viewport_size({"width": 1280, "height": 720})
+        camera.page.click("#far-tab-marks summary")
+        camera.page.keyboard.press("y")
+        camera.until("#why-state[data-outcome='UNSURE']")
+        camera.take("why_marked", settle=2.0)
         camera.page.close()
 
 

@@ -73,9 +73,7 @@ class Answerer:
     critics: tuple[str, ...]
     """RECORDED and the files that can be chosen."""
     said: str = ""
-    """The latest it has to say: a correction that could not be stored."""
-    corrections: int = 0
-    """Corrections stored so far: the page reads them again."""
+    """The latest it has to say: a correction or a mark that could not be stored."""
 
 
 @register

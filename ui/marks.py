@@ -44,7 +44,7 @@ class Marks:
         gui.add_html('<div class="mark-note"></div>')
         self._field = gui.add_text("note", "", hint="a note on this attempt")
         presses.on_text(self._field, self._write, NOTE_LIMIT)
-        panels.place_before(self.name, "mark-note", (8.7, 14.4, 15.3, 4.1))
+        panels.place_after(self.name, "mark-note", (8.7, 14.4, 15.3, 4.1))
 
     def _write(self, text: str) -> None:
         self._draft = text
@@ -111,18 +111,19 @@ class Marks:
     def html(self, telemetry: Telemetry | None) -> str:
         if telemetry is None or (place := self._place(telemetry)) is None:
             return '<p class="far-line">No attempt yet.</p>'
-        judged = self.chosen(telemetry)
-        program = "under way" if judged is None else f"{_word(judged.success)} ({judged.judged_by})"
-        person = "nothing yet"
-        if judged is not None and (judged.verdict or judged.note):
-            person = ", ".join(part for part in (judged.verdict, judged.by and f"by {judged.by}", judged.note) if part)
-        tone = "idle" if judged is None else {True: "good", False: "warn", None: "learn"}[judged.final]
-        return (
-            f'<p class="far-line"><b>Trial {place[0]}, attempt {place[1]}</b></p>'
-            f'<p class="far-line">program: {escape(program)}</p>'
-            f'<p class="far-line tone-{tone}">person: {escape(person)}</p>'
-        )
+        return both(place, self.chosen(telemetry), "under way")
 
 
-def _word(success: bool) -> str:
-    return "success" if success else "failure"
+def both(place: tuple[int, int], judged: Judged | None, otherwise: str) -> str:
+    """The program's judgment of a (trial, attempt) and a person's word beside it, as HTML; `otherwise`: what it is
+    where nobody has judged it."""
+    program = otherwise if judged is None else f"{'success' if judged.success else 'failure'} ({judged.judged_by})"
+    person = "nothing yet"
+    if judged is not None and (judged.verdict or judged.note):
+        person = ", ".join(part for part in (judged.verdict, judged.by and f"by {judged.by}", judged.note) if part)
+    tone = "idle" if judged is None else {True: "good", False: "warn", None: "learn"}[judged.final]
+    return (
+        f'<p class="far-line"><b>Trial {place[0]}, attempt {place[1]}</b></p>'
+        f'<p class="far-line">program: {escape(program)}</p>'
+        f'<p class="far-line tone-{tone}">person: {escape(person)}</p>'
+    )

@@ -101,27 +101,11 @@ class Panels:
         if hotkey is not None:
             presses.on(hotkey, lambda: self._press(item))
         self._buttons.append((item, handle, hotkey))
-        self.place(panel.name, handle._impl.uuid, item.box)
+        self._places.append(placed(panel.name, by_id(handle._impl.uuid), item.box))
 
-    def place(self, panel: str, uuid: str, box: Box) -> None:
-        """A widget of a panel: where it is, and that it is hidden with its panel."""
-        left, top, width, height = box
-        self._places.append(
-            f'div:has(> [id="{uuid}"]) {{ left: calc(var(--panel-left) + {left} * var(--u)); '
-            f"top: calc(var(--panel-top) + {top} * var(--u)); width: calc({width} * var(--u)); "
-            f"height: calc({height} * var(--u)); z-index: 31 !important; }} "
-            f'{closed(panel)} div:has(> [id="{uuid}"]) {{ display: none; }}'
-        )
-
-    def place_before(self, panel: str, mark: str, box: Box) -> None:
+    def place_after(self, panel: str, mark: str, box: Box) -> None:
         """The widget after the HTML marked so: a text field's own id is deep within it."""
-        left, top, width, height = box
-        self._places.append(
-            f"div:has(> .{mark}) + div {{ left: calc(var(--panel-left) + {left} * var(--u)); "
-            f"top: calc(var(--panel-top) + {top} * var(--u)); width: calc({width} * var(--u)); "
-            f"height: calc({height} * var(--u)); z-index: 31 !important; }} "
-            f"{closed(panel)} div:has(> .{mark}) + div {{ display: none; }}"
-        )
+        self._places.append(placed(panel, after(mark), box))
 
     @property
     def style(self) -> str:
@@ -168,6 +152,27 @@ def _frame_place(panel: Panel) -> str:
         f"div:has(> .panel-{panel.name}) {{ left: var(--panel-left); top: var(--panel-top); "
         f"width: calc(33 * var(--u)); height: calc({panel.height} * var(--u)); z-index: 30 !important; }} "
         f"{closed(panel.name)} div:has(> .panel-{panel.name}) {{ display: none; }}"
+    )
+
+
+def by_id(uuid: str) -> str:
+    """The selector of a widget."""
+    return f'div:has(> [id="{uuid}"])'
+
+
+def after(mark: str) -> str:
+    """The selector of the widget after the HTML marked so."""
+    return f"div:has(> .{mark}) + div"
+
+
+def placed(panel: str, selector: str, box: Box) -> str:
+    """A widget of a panel: where it is, and that it is hidden with its panel."""
+    left, top, width, height = box
+    return (
+        f"{selector} {{ left: calc(var(--panel-left) + {left} * var(--u)); "
+        f"top: calc(var(--panel-top) + {top} * var(--u)); width: calc({width} * var(--u)); "
+        f"height: calc({height} * var(--u)); z-index: 31 !important; }} "
+        f"{closed(panel)} {selector} {{ display: none; }}"
     )
 
 

@@ -11,24 +11,31 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from far_app.marks import Judged
 from far_app.types import Contrast
 from far_app.what_if import Answer
 from ui import why_svg
 from ui.why_model import Attribution, Case, q_colors
 
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 92]
-_TONE = {"failure": "bad", "success": "good", "cut off": "warn"}
+_TONE = {"failure": "bad", "success": "good", "cut off": "warn", "unsure": "learn"}
 
 
-def head(case: Case | None, found: Attribution | None, tick: int, attempt: int, attempts: int, why_not: str) -> str:
-    """Outcome, which attempt, what is flagged, where one looks."""
+def head(
+    case: Case | None, found: Attribution | None, tick: int, attempt: int, attempts: int, why_not: str,
+    judged: Judged | None = None,
+) -> str:  # fmt: skip
+    """Outcome by the last word, which attempt, what is flagged, where one looks."""
     if case is None or found is None:
         word, tone, line, below = "UNREADABLE", "warn", why_not, ""
     else:
-        word, tone = case.outcome.upper(), _TONE[case.outcome]
+        outcome = judged.verdict.value if judged is not None and judged.verdict is not None else case.outcome
+        word, tone = outcome.upper(), _TONE[outcome]
+        marked = f"marked by {judged.by or 'a person'}" if judged is not None and judged.verdict is not None else ""
         n = len(found.flagged)
         line = f"{n} chunk{'s' if n != 1 else ''} flagged · {found.source}"
-        below = " · ".join(part for part in (f"policy {case.version}" if case.version else "", case.lesson) if part)
+        policy = f"policy {case.version}" if case.version else ""
+        below = " · ".join(part for part in (marked, policy, case.lesson) if part)
     flagged = found.flagged if found is not None else ()
     place = f"{flagged.index(tick) + 1}" if tick in flagged else "–"
     name = case.name if case is not None else "attempt"

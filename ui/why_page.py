@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 import viser
 
+from far_app.marks import Judged, Mark
 from ui import why_html
 from ui.keys import Page, add_hotkey, hint, key_of
 from ui.page_server import Presses
 from ui.presence import Presence
 from ui.scene3d import BRAND
 from ui.viewers import Live, Viewers
+from ui.why_marks import WhyMarks
 from ui.why_model import Attribution, Case
 from ui.why_scene import WhyScene
 from ui.why_state import Looking, Offer, Press
@@ -58,6 +60,11 @@ class Shown:
     """The Answer of the latest adapt-again of this attempt."""
     moved: tuple[np.ndarray, np.ndarray] | None = None
     moved_words: str = ""
+    place: tuple[int, int] | None = None
+    """(trial, attempt)."""
+    judged: Judged | None = None
+    marks: tuple[Mark, ...] = ()
+    """People's words on it, oldest first."""
     session: str = ""
     problems: tuple[str, ...] = ()
     said: str = ""
@@ -99,6 +106,8 @@ class WhyPage:
         self._add_slider(Press.TICK, "", 0, 150, 1, slot="pick")  # unseen, over the charts: a click or a drag there
         self._numbers = gui.add_html(why_html.numbers(None, None, 0, ""))
         self._foot = gui.add_html(why_html.foot("", (), "", ""))
+        self.marks = WhyMarks(gui, self._presses, lambda press: self.events.put((press, 0.0)))
+        places.append(self.marks.style)
         gui.add_html(f"<style>{_STYLE}\n@media (min-width: 768px) {{ {' '.join(places)} }}</style>")
 
     def _add_button(self, press: Press, label: str, color: tuple[int, int, int], column: int, row: int) -> str:
@@ -130,7 +139,7 @@ class WhyPage:
         tick, case, found = s.looking.tick, s.case, s.found
         flagged = found is not None and tick in found.flagged
         horizon = found.horizon if found is not None else 0
-        self._head.content = why_html.head(case, found, tick, s.looking.attempt, s.attempts, s.unreadable)
+        self._head.content = why_html.head(case, found, tick, s.looking.attempt, s.attempts, s.unreadable, s.judged)
         self._frames.content = why_html.frames(case, tick, horizon, flagged)
         self._charts.content = why_html.charts(found, tick)
         self._numbers.content = why_html.numbers(case, found, tick, s.note)
@@ -146,7 +155,8 @@ class WhyPage:
             line = f"{offer.line} · {hint(Page.WHY, press)}".removeprefix(" · ") if offer.enabled else offer.line
             name = names.get(press, label)
             live.append(Live(button=handle, hotkey=hotkey, enabled=offer.enabled, label=name, line=line))
-        self._viewers.show(live)
+        self.marks.show(s.place, s.judged, s.marks)
+        self._viewers.show([*live, *self.marks.live(s.offers)])
         self._set_sliders(s)
         if self._scene is not None:
             key = (id(case), id(found), tick, id(s.moved))

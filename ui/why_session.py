@@ -5,7 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from far_app.errors import RecordingError
+from far_app.marks import Judged, Mark
+from far_app.recording.append_file import being_written
 from far_app.recording.corrections import CORRECTIONS_FILE, Corrections, corrections
+from far_app.recording.judged import judged
+from far_app.recording.marks import MARKS_FILE
 from far_app.recording.reader import SessionRecording, read_attempt, read_session
 from far_app.recording.schema import TRIALS_FILE
 from far_app.types import FlagCorrection
@@ -20,6 +24,7 @@ class Sitting:
         self._stamps: tuple[object, ...] = ()
         self._cases: dict[Path, tuple[object, Case | str]] = {}
         self._corrections: Corrections = {}
+        self._judged: dict[tuple[int, int], Judged] = {}
         self.session: SessionRecording
         self.problems: tuple[str, ...] = ()
         self.refresh()
@@ -27,13 +32,15 @@ class Sitting:
 
     def refresh(self) -> bool:
         """Look whether something was added; True when so."""
-        stamps = tuple(_stamp(self.path / name) for name in (TRIALS_FILE, CORRECTIONS_FILE))
+        stamps = tuple(_stamp(self.path / name) for name in (TRIALS_FILE, CORRECTIONS_FILE, MARKS_FILE))
+        stamps += (being_written(self.path / TRIALS_FILE),)
         stamps += tuple(_stamp(file) for file in sorted(self.path.glob("trial_*/attempt_*.mcap"))[-2:])
         if stamps == self._stamps:
             return False
         self._stamps = stamps
         self.session = read_session(self.path)
         self._corrections, cut = corrections(self.session)
+        self._judged = judged(self.session)
         live = ("the session is still being recorded",) if self.session.live else ()
         ended = any(entry.event == "session_ended" for entry in self.session.log)
         crash = () if ended or self.session.live else ("the session was not closed: its program ended without warning",)
@@ -69,6 +76,16 @@ class Sitting:
     def words(self, index: int) -> tuple[FlagCorrection, ...]:
         """The operator's words on its chunks, oldest first."""
         return self._corrections.get(self.place(index), ())
+
+    def judgment(self, index: int) -> Judged | None:
+        """How it was judged, by the program and by people; None of an attempt that has not ended."""
+        return self._judged.get(self.place(index)) if 0 <= index < len(self.files) else None
+
+    def marks(self, index: int) -> tuple[Mark, ...]:
+        """People's words on it, oldest first."""
+        if not 0 <= index < len(self.files):
+            return ()
+        return tuple(word for word in self.session.words if (word.trial, word.attempt) == self.place(index))
 
     def newest_failure(self) -> int:
         """The newest attempt that failed and was learnt from or ended; else the newest; 0 of an empty session."""

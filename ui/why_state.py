@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
+from far_app.marks import Judged, Verdict
 from far_app.what_if import RECORDED
 from ui.why_model import Attribution, Case, Choice, Setting, beside
 
@@ -22,9 +23,19 @@ class Press(StrEnum):
     CRITIC = "critic"
     RESET = "reset"
     ADAPT = "adapt"
+    MARK_SUCCESS = "mark_success"
+    MARK_FAILURE = "mark_failure"
+    MARK_UNSURE = "mark_unsure"
+    KEEP_NOTE = "keep_note"
     TICK = "tick"
     RHO = "rho"
     HORIZON = "horizon"
+
+
+VERDICTS = {
+    Press.MARK_SUCCESS: Verdict.SUCCESS, Press.MARK_FAILURE: Verdict.FAILURE, Press.MARK_UNSURE: Verdict.UNSURE,
+}  # fmt: skip
+"""What each press says of the attempt; Press.KEEP_NOTE says nothing but its note."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,3 +116,15 @@ def offers(
         Press.CRITIC: (one, ""), Press.RESET: (changed, ""), Press.ADAPT: (adapt, ""),
     }  # fmt: skip
     return {press: Offer(enabled=not why, line=why or hint) for press, (why, hint) in rows.items()}
+
+
+def mark_offers(judged: Judged | None, cannot_keep: str, note: str) -> dict[Press, Offer]:
+    """The words on the attempt on show. `cannot_keep`: "" or why nobody keeps them; `note`: what is written."""
+    nobody = cannot_keep or ("it has not ended" if judged is None else "")
+    reasons = {press: nobody or _said_already(judged, verdict) for press, verdict in VERDICTS.items()}
+    reasons[Press.KEEP_NOTE] = nobody or ("" if note.strip() else "write one first")
+    return {press: Offer(enabled=not why, line=why) for press, why in reasons.items()}
+
+
+def _said_already(judged: Judged | None, verdict: Verdict) -> str:
+    return "a person said so" if judged is not None and judged.verdict is verdict else ""

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from far_app.recording.corrections import now as wall_clock
+from far_app.marks import Mark, MarkAttempt
+from far_app.recording.said_lines import now as wall_clock
 from far_app.types import FlagCorrection
 from far_app.what_if import RECORDED, CorrectFlag
 from ui.access import Access
@@ -20,7 +21,7 @@ from ui.why_link import Link
 from ui.why_model import Attribution, Case, attribution, deepest
 from ui.why_page import Shown, WhyPage
 from ui.why_session import Sitting
-from ui.why_state import Press, fresh, moved, offers
+from ui.why_state import VERDICTS, Press, fresh, mark_offers, moved, offers
 
 REST, LOOK_AGAIN = 0.3, 1.0
 """Seconds between two looks at the sockets when nothing is pressed, and at the session's folder."""
@@ -160,12 +161,16 @@ class View:
             note = "better chunks are drawn for flagged ones"
         answerer = self._link.answerer
         problems = (*(case.problems if case is not None else ()), *sitting.problems)
+        judged, nobody = sitting.judgment(looking.attempt), self._link.cannot_correct
+        running = "it still runs: mark on its page" if sitting.session.live and self._link.critics else ""
         return Shown(
             looking=looking, case=case, found=found, attempts=len(sitting.files), scale=sitting.setting.scale,
             offers=offers(
                 looking, case, found, attempts=len(sitting.files), critics=self._link.critics,
-                can_correct=self._link.cannot_correct, adapting=self._asking.adapting,
-            ),
+                can_correct=nobody, adapting=self._asking.adapting,
+            ) | mark_offers(judged, nobody or running, self._page.marks.note),
+            place=sitting.place(looking.attempt) if sitting.files else None, judged=judged,
+            marks=sitting.marks(looking.attempt),
             unreadable=self._case if isinstance(self._case, str) else "", note=note, lesson=lesson, moved=pair,
             moved_words=_moved_words(pair, sitting.setting.scale) if pair else "",
             session=sitting.session.header.session, problems=problems,
@@ -184,6 +189,8 @@ class View:
         self._said = ""
         if press in (Press.ATTEMPT_NEXT, Press.ATTEMPT_PREVIOUS):
             self._open(self._looking.attempt + (1 if press is Press.ATTEMPT_NEXT else -1), chosen=True)
+        elif press in VERDICTS or press is Press.KEEP_NOTE:
+            self._mark(press)
         elif case is None or self._found is None:
             return
         elif press is Press.RESET:
@@ -207,9 +214,22 @@ class View:
             tick=tick, flagged=tick not in found.flagged, by=self._options.operator, wall=wall_clock()
         )
         session = self._sitting.session.header.session
-        asked = CorrectFlag(session=session, trial=trial, attempt=attempt, correction=correction)
-        if not self._link.send(asked):
-            self._said = "nobody took the correction: is far replay (or far run) still running?"
+        self._tell(CorrectFlag(session=session, trial=trial, attempt=attempt, correction=correction), "correction")
+
+    def _mark(self, press: Press) -> None:
+        """A verdict or a note on the attempt on show, which stays on show."""
+        self._looking = replace(self._looking, chosen=True)
+        trial, attempt = self._sitting.place(self._looking.attempt)
+        note = self._page.marks.take_note() if press is Press.KEEP_NOTE else ""
+        mark = Mark(
+            trial=trial, attempt=attempt, verdict=VERDICTS.get(press), note=note, by=self._options.operator,
+            wall=wall_clock(),
+        )  # fmt: skip
+        self._tell(MarkAttempt(session=self._sitting.session.header.session, mark=mark), "mark")
+
+    def _tell(self, word: CorrectFlag | MarkAttempt, what: str) -> None:
+        if not self._link.send(word):
+            self._said = f"nobody took the {what}: is far replay (or far run) still running?"
         self._looked = 0.0
 
 

@@ -7,10 +7,9 @@ import getpass
 from collections.abc import Sequence
 from pathlib import Path
 
-from far_app.errors import ConfigError
 from far_app.marks import Mark, Verdict
-from far_app.recording import marks
 from far_app.recording.inspect import find_session
+from far_app.recording.judged import mark_closed
 from far_app.recording.reader import read_session
 
 
@@ -23,20 +22,10 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--note", default="")
     parser.add_argument("--by", default=None, help="who says so; your login by default")
     options = parser.parse_args(list(arguments))
-    session = read_session(find_session(options.session))
-    if session.live:
-        raise ConfigError(f"{session.path} is still being recorded; mark its attempts on its page")
-    key = options.trial, options.attempt
-    if key not in session.marks:
-        known = ", ".join(f"{t}.{a}" for t, a in session.marks) or "none"
-        raise ConfigError(
-            f"{session.path} has no ended attempt {key[1]} of trial {key[0]}; it has (trial.attempt) {known}"
-        )
-    before = "unsure" if key in session.unsure else "success" if session.marks[key].success else "failure"
     verdict = None if options.verdict == "note" else Verdict(options.verdict)
     by = options.by if options.by is not None else getpass.getuser()
-    marks.append(
-        session.path, Mark(trial=key[0], attempt=key[1], verdict=verdict, note=options.note, by=by)
-    )  # fmt: skip
-    print(f"trial {key[0]}, attempt {key[1]}: {before} → {verdict or before} by {by} {options.note}".rstrip())
+    mark = Mark(trial=options.trial, attempt=options.attempt, verdict=verdict, note=options.note, by=by)
+    final = mark_closed(read_session(find_session(options.session)), mark).final
+    before = "unsure" if final is None else "success" if final else "failure"
+    print(f"trial {mark.trial}, attempt {mark.attempt}: {before} → {verdict or before} by {by} {mark.note}".rstrip())
     return 0

@@ -1,4 +1,4 @@
-"""The app's side of `far replay`: answers the attempt view's questions, keeps its corrections. No robot, no session.
+"""The app's side of `far replay`: answers the attempt view's questions, keeps what is said there. No robot, no session.
 
 One thread listens and publishes, one computes; a newer question cancels the one under way.
 """
@@ -20,8 +20,10 @@ from far_app.cli.assemble import checkpoints
 from far_app.config import RetryConfig, from_table
 from far_app.endpoints import Endpoints
 from far_app.errors import ConfigError, FarError
+from far_app.marks import MarkAttempt
 from far_app.recording import corrections
-from far_app.recording.reader import SessionRecording, read_attempt
+from far_app.recording.judged import mark_closed
+from far_app.recording.reader import SessionRecording, read_attempt, read_session
 from far_app.what_if import RECORDED, Answer, Answerer, CorrectFlag, Question
 from far_app.wire import WireError, pack, unpack
 
@@ -50,7 +52,7 @@ class Desk:
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._questions: queue.SimpleQueue[Question | None] = queue.SimpleQueue()
         self._newest = 0
-        self._said, self._kept = "", 0
+        self._said = ""
         self._worker = threading.Thread(target=self._compute, name="what-if", daemon=True)
         self._worker.start()
 
@@ -66,7 +68,7 @@ class Desk:
                     self._pub.send(pack(answer))
             if time.monotonic() > due:
                 due = time.monotonic() + 0.5
-                self._pub.send(pack(Answerer(critics=self._critics, said=self._said, corrections=self._kept)))
+                self._pub.send(pack(Answerer(critics=self._critics, said=self._said)))
 
     def close(self) -> None:
         self._newest = -1
@@ -83,21 +85,25 @@ class Desk:
         if isinstance(message, Question):
             self._newest = message.number
             self._questions.put(message)
-        elif isinstance(message, CorrectFlag):
+        elif isinstance(message, CorrectFlag | MarkAttempt):
             self._keep(message)
 
-    def _keep(self, asked: CorrectFlag) -> None:
+    def _keep(self, asked: CorrectFlag | MarkAttempt) -> None:
+        """A word on a chunk or on an attempt, beside the recording."""
         if asked.session != self._session.header.session:
-            self._said = f"a correction for session {asked.session} is not stored in {self._session.header.session}"
+            self._said = f"a word on session {asked.session} is not stored in {self._session.header.session}"
             return
-        word = corrections.Word(trial=asked.trial, attempt=asked.attempt, correction=asked.correction)
         try:
-            corrections.append(self._session.path, word)
+            if isinstance(asked, MarkAttempt):
+                mark_closed(read_session(self._session.path), asked.mark)
+            else:
+                word = corrections.Word(trial=asked.trial, attempt=asked.attempt, correction=asked.correction)
+                corrections.append(self._session.path, word)
         except FarError as error:
             self._said = str(error)
             log.warning("%s", error)
         else:
-            self._said, self._kept = "", self._kept + 1
+            self._said = ""
 
     def _compute(self) -> None:
         networks: dict[str, Networks] = {}

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import fcntl
+import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
-from far_app.cli import main
+from far_app.cli import main, replay_desk
 from far_app.errors import RecordingError
 from far_app.exchange.select import Selection, rollouts
 from far_app.marks import NOTE_LIMIT, Mark, MarkAttempt, Verdict, trouble
 from far_app.recording import marks
 from far_app.recording.episodes import session_episodes
+from far_app.recording.judged import judged
 from far_app.recording.reader import read_session
 from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
@@ -24,6 +31,7 @@ from far_app.types import Attempt, Judge, Outcome
 from tests.recording import sessions
 from tests.session.kinematic import Forward, KinematicRobot
 from tests.session.test_session import Desk
+from ui.why_link import Link
 
 
 def word(trial: int, attempt: int, verdict: Verdict | None = None, note: str = "") -> MarkAttempt:
@@ -143,3 +151,61 @@ def test_the_history_is_told_anew_after_a_change_and_only_then():
     assert history.trials[0].success and history.attempts[0].verdict is Verdict.SUCCESS
     history.attempt_ended(2, attempt)
     assert len(history.attempts) == 2
+
+
+def test_what_the_page_of_far_replay_says_is_kept_as_far_mark_keeps_it(tmp_path):
+    by_page, by_command = (sessions.small_session(tmp_path / name, steps=3) for name in ("page", "command"))
+    name = read_session(by_page).header.session
+    with answering(by_page) as (say, said):
+        say(replace(word(1, 1, Verdict.SUCCESS, "in the bin"), session=name))
+        assert eventually(lambda: read_session(by_page).words != ())
+        say(replace(word(4, 1, Verdict.SUCCESS), session=name))
+        assert eventually(lambda: "no ended attempt 1 of trial 4" in said())
+        say(word(1, 2, Verdict.SUCCESS))
+        assert eventually(lambda: "a word on session test" in said())
+    assert main(["mark", str(by_command), "1", "1", "success", "--note", "in the bin", "--by", "ada"]) == 0
+    (kept,), (as_typed,) = read_session(by_page).words, read_session(by_command).words
+    assert replace(kept, wall="") == replace(as_typed, wall="") and kept.wall and kept.by == "ada"
+    told = judged(read_session(by_page))[1, 1]
+    assert (told.success, told.judged_by) == (False, "horizon"), "the program's own judgment stays"
+    assert told.final is True and told.note == "in the bin"
+
+
+def test_a_session_that_is_still_recorded_takes_no_word_but_from_its_own_page(tmp_path):
+    path = sessions.small_session(tmp_path, steps=3)
+    with (path / "trials.jsonl").open("ab") as log, answering(path) as (say, said):
+        fcntl.flock(log, fcntl.LOCK_EX)  # as the recorder of a living session holds it
+        say(replace(word(1, 1, Verdict.SUCCESS), session=read_session(path).header.session))
+        assert eventually(lambda: "still being recorded" in said())
+    assert read_session(path).words == ()
+
+
+@contextmanager
+def answering(path: Path) -> Iterator[tuple[Callable[[MarkAttempt], bool], Callable[[], str]]]:
+    """`far replay`'s own desk at work, and the attempt view's end of its sockets: say a word, hear the answer."""
+    ended = threading.Event()
+    with TemporaryDirectory(prefix="far") as sockets:
+        desk = replay_desk.Desk(Path(sockets), read_session(path), (), lambda name: pytest.fail("no question is asked"))
+        thread = threading.Thread(target=desk.serve, args=(ended.is_set,))
+        thread.start()
+        link = Link(Path(sockets))
+
+        def said() -> str:
+            list(link.poll())
+            return link.answerer.said if link.answerer is not None else ""
+
+        try:
+            assert eventually(lambda: said() == "" and link.answerer is not None)
+            yield link.send, said
+        finally:
+            ended.set()
+            thread.join()
+            link.close()
+            desk.close()
+
+
+def eventually(condition: Callable[[], bool]) -> bool:
+    end = time.monotonic() + 10
+    while time.monotonic() < end and not condition():
+        time.sleep(0.02)
+    return condition()

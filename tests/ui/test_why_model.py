@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 from far_app.errors import RecordingError
-from far_app.recording import corrections
+from far_app.marks import Judged, Mark, Verdict
+from far_app.recording import corrections, marks
 from far_app.recording.reader import read_attempt, read_session
 from far_app.types import Contrast, FlagCorrection
 from far_app.what_if import RECORDED, Answer
-from ui import why_html
+from ui import why_html, why_marks
 from ui.why_model import Case, Choice, attribution, beside, case_of, deepest, executed, path, q_colors
 from ui.why_session import Sitting
-from ui.why_state import Looking, Press, moved, offers
+from ui.why_state import VERDICTS, Looking, Press, mark_offers, moved, offers
 
 SAMPLE = Path(__file__).resolve().parents[2] / "recordings/sample"
 AS_RECORDED = Choice()
@@ -169,3 +170,32 @@ def test_a_session_that_cannot_be_written_says_what_to_do(tmp_path: Path) -> Non
     word = corrections.Word(trial=1, attempt=1, correction=FlagCorrection(tick=1, flagged=True))
     with pytest.raises(RecordingError, match="copy the session"):
         corrections.append(tmp_path / "missing", word)
+
+
+def test_a_word_on_an_attempt_is_shown_beside_the_programs_judgment_and_decides_the_head(session: Path) -> None:
+    sitting = Sitting(session)
+    before, case = sitting.judgment(0), sitting.case(0)
+    assert before is not None and isinstance(case, Case) and before.verdict is None and not sitting.marks(0)
+    for verdict, note in ((Verdict.SUCCESS, ""), (Verdict.UNSURE, "it <b>tipped</b>")):
+        marks.append(session, Mark(trial=1, attempt=1, verdict=verdict, note=note, by="ada"))
+    assert sitting.refresh()
+    judged, words = sitting.judgment(0), sitting.marks(0)
+    assert judged is not None and (judged.success, judged.judged_by) == (False, "horizon")
+    text = why_marks.panel((1, 1), judged, words)
+    assert "program: failure (horizon)" in text and "person: unsure, by ada" in text
+    assert text.index("ada: unsure") < text.index("ada: success") and "<b>tipped" not in text
+    found = attribution(case, AS_RECORDED)
+    assert 'data-outcome="UNSURE"' in why_html.head(case, found, 50, 0, 2, "", judged)
+    assert 'data-outcome="FAILURE"' in why_html.head(case, found, 50, 0, 2, "", before)
+    assert sitting.judgment(1) != judged and sitting.marks(1) == ()
+
+
+def test_a_mark_that_cannot_be_kept_says_why() -> None:
+    failed = Judged(trial=1, attempt=1, success=False, judged_by="horizon")
+    free = mark_offers(failed, "", "")
+    assert all(free[press].enabled for press in VERDICTS) and free[Press.KEEP_NOTE].line == "write one first"
+    assert mark_offers(failed, "", "slipped")[Press.KEEP_NOTE].enabled
+    said = mark_offers(replace(failed, verdict=Verdict.FAILURE), "", "")
+    assert not said[Press.MARK_FAILURE].enabled and said[Press.MARK_SUCCESS].enabled
+    assert {offer.line for offer in mark_offers(None, "", "x").values()} == {"it has not ended"}
+    assert {offer.line for offer in mark_offers(failed, "nobody keeps it", "x").values()} == {"nobody keeps it"}

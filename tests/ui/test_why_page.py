@@ -13,6 +13,9 @@ from typing import Any
 import pytest
 from ui_process import free_port, wait_until
 
+from far_app.marks import Verdict
+from far_app.recording.reader import read_session
+
 sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright (the dev extra)")
 CHROMIUM = Path("/usr/bin/chromium")
 ROOT = Path(__file__).resolve().parents[2]
@@ -125,6 +128,28 @@ def test_the_operators_word_is_kept_beside_the_recording(page: Any, session: Pat
     page.get_by_role("button", name="Flag to blame").click()
     page.wait_for_selector("#why-state[data-flagged='15']", timeout=SETTLED)
     assert wait_until(lambda: len((session / "corrections.jsonl").read_text().splitlines()) == 2)
+
+
+def test_an_attempt_is_marked_by_key_and_click_beside_the_programs_judgment(page: Any, session: Path) -> None:
+    page.click("#far-tab-marks summary")
+    assert "program: failure (horizon)" in page.inner_text("#why-marks")
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press("y")
+    page.wait_for_selector("#why-state[data-outcome='UNSURE']", timeout=SETTLED)
+    page.locator("div:has(> .mark-note) + div input").click()
+    page.keyboard.type("look at it again")
+    page.locator("button:has-text('Keep note'):not(:disabled)").click()
+    page.wait_for_selector("#why-marks:has-text('ada: look at it again')", timeout=SETTLED)
+    page.wait_for_function("() => document.querySelector('div:has(> .mark-note) + div input').value === ''")
+    page.get_by_role("button", name="Failure").click()
+    page.wait_for_selector("#why-state[data-outcome='FAILURE']", timeout=SETTLED)
+    assert "program: failure (horizon)" in page.inner_text("#why-marks")
+    words = read_session(session).words
+    assert [(w.verdict, w.note, w.by) for w in words] == [
+        (Verdict.UNSURE, "", "ada"), (None, "look at it again", "ada"), (Verdict.FAILURE, "", "ada"),
+    ]  # fmt: skip
+    assert all(w.wall for w in words)
+    page.click("#far-tab-marks summary")
 
 
 def test_adapting_again_shows_both_losses_and_what_moved(page: Any) -> None:
