@@ -22,8 +22,8 @@ from ui.page_server import Presses
 
 TILE = 320
 """Pixels of each picture's side."""
-ROWS = 2
-"""Cameras that fit."""
+CAMERAS = 2
+"""That fit, beside or below each other as trials.css has it."""
 _RED = np.array([255.0, 45.0, 45.0])
 
 
@@ -33,8 +33,11 @@ class SceneOverlay:
     def __init__(self, gui: viser.GuiApi, presses: Presses) -> None:
         self._blend = 0.5
         self._words = gui.add_html("", visible=False)
-        self._slot = gui.add_html('<div class="far-slot slot-overlay"></div>', visible=False)
-        self._picture = gui.add_image(np.zeros((8, 8, 3), np.uint8), format="jpeg", visible=False)
+        self._pictures: list[tuple[viser.GuiHtmlHandle, viser.GuiImageHandle]] = []
+        for number in range(1, CAMERAS + 1):
+            slot = gui.add_html(f'<div class="far-slot slot-overlay overlay-{number}"></div>', visible=False)
+            blank = np.zeros((8, 8, 3), np.uint8)
+            self._pictures.append((slot, gui.add_image(blank, format="jpeg", visible=False)))
         self._label = gui.add_html('<div class="far-slot slot-blend">live over start image</div>', visible=False)
         self._slider = gui.add_slider(" ", min=0.0, max=1.0, step=0.05, initial_value=self._blend, visible=False)
         presses.on_value(self._slider, self._slid)
@@ -45,14 +48,15 @@ class SceneOverlay:
     def show(self, telemetry: Telemetry | None, view: View | None) -> None:
         scene = telemetry.scene if telemetry is not None and telemetry.state is State.AWAITING_SCENE else None
         self._words.visible = scene is not None
-        drawn = None
+        drawn: Sequence[np.ndarray] = ()
         if scene is not None:
             self._words.content = words(scene, telemetry.refusal if telemetry is not None else "")
-            drawn = sheet(scene.reference, view.jpegs if view is not None else {}, self._blend)
-        for part in (self._slot, self._picture, self._label, self._slider):
-            part.visible = drawn is not None
-        if drawn is not None:
-            self._picture.image = drawn
+            drawn = overlays(scene.reference, view.jpegs if view is not None else {}, self._blend)
+        self._label.visible = self._slider.visible = bool(drawn)
+        for number, (slot, picture) in enumerate(self._pictures):
+            slot.visible = picture.visible = number < len(drawn)
+            if number < len(drawn):
+                picture.image = drawn[number]
 
 
 def words(scene: SceneShown, refusal: str = "") -> str:
@@ -68,22 +72,23 @@ def words(scene: SceneShown, refusal: str = "") -> str:
         text = f"match {scores} (limit {scene.limit:.2f}): {'it matches' if tone == 'good' else 'not yet'}"
     heads = "<p>left: live over start image · right: what differs, in red</p>" * bool(scene.reference)
     why = f'<p class="why">{escape(refusal)}</p>' if refusal else ""
+    pictured = "pictured " * bool(scene.reference)
     return (
-        f'<div class="far-card far-scene tone-{tone}" id="op-scene" data-tone="{tone}"><h2>Scene {escape(scene.name)} '
-        f"<em>{escape(text)}</em></h2>{heads}{why}</div>"
+        f'<div class="far-card far-scene {pictured}tone-{tone}" id="op-scene" data-tone="{tone}">'
+        f"<h2>Scene {escape(scene.name)} <em>{escape(text)}</em></h2>{heads}{why}</div>"
     )
 
 
-def sheet(
+def overlays(
     reference: Mapping[str, bytes], live: Mapping[str, bytes], blend: float, tile: int = TILE
-) -> UInt8[np.ndarray, "H W 3"] | None:
-    """A row for each camera: live over its start image, difference. RGB; None where there is no start image."""
-    rows = []
-    for camera, png in list(reference.items())[:ROWS]:
+) -> tuple[UInt8[np.ndarray, "H W 3"], ...]:
+    """For each camera with a start image: live over it, and the difference beside that. RGB."""
+    drawn = []
+    for camera, png in list(reference.items())[:CAMERAS]:
         start, now = picture(png), picture(live.get(camera, b""))
         if start is not None:
-            rows.append(_row(start, start if now is None else now, blend if now is not None else 0.0, tile))
-    return np.vstack(rows) if rows else None
+            drawn.append(_overlay(start, start if now is None else now, blend if now is not None else 0.0, tile))
+    return tuple(drawn)
 
 
 def picture(raw: bytes) -> UInt8[np.ndarray, "H W 3"] | None:
@@ -92,7 +97,7 @@ def picture(raw: bytes) -> UInt8[np.ndarray, "H W 3"] | None:
     return None if bgr is None else cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
-def _row(start: np.ndarray, now: np.ndarray, blend: float, tile: int) -> UInt8[np.ndarray, "H W 3"]:
+def _overlay(start: np.ndarray, now: np.ndarray, blend: float, tile: int) -> UInt8[np.ndarray, "H W 3"]:
     height = max(1, round(tile * start.shape[0] / start.shape[1]))
     there, here = (cv2.resize(p, (tile, height), interpolation=cv2.INTER_LINEAR) for p in (start, now))
     over = cv2.addWeighted(there, 1.0 - blend, here, blend, 0.0)

@@ -14,7 +14,7 @@ from far_app.recording.images import encode_png
 from far_app.session_states import Intent, State
 from far_app.trial_plan.shown import ArmShown, DifferenceShown, PlanShown, SceneShown
 from ui.raw_client import RawClient
-from ui.scene_overlay import sheet, words
+from ui.scene_overlay import overlays, words
 from ui.trials_panel import card
 
 Start = Callable[..., PageProcess]
@@ -58,23 +58,22 @@ def jpeg(x: int) -> bytes:
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
 
 
-def test_the_sheet_shows_start_blend_and_what_differs():
-    shown = sheet({"front": png(10)}, {"front": jpeg(50)}, 0.25, tile=84)
-    alone = sheet({"front": png(10)}, {"front": jpeg(50)}, 0.0, tile=84)
-    assert shown is not None and alone is not None and shown.shape == (84, 2 * 84 + 4, 3)
+def test_the_overlay_shows_start_blend_and_what_differs():
+    (shown,) = overlays({"front": png(10)}, {"front": jpeg(50)}, 0.25, tile=84)
+    (alone,) = overlays({"front": png(10)}, {"front": jpeg(50)}, 0.0, tile=84)
+    assert shown.shape == (84, 2 * 84 + 4, 3)
     over, differing = shown[:, :84], shown[:, 88:]
     assert alone[46, 16, 0] > 200 and alone[46, 56, 0] < 140, "the start image alone"
     assert 120 < over[46, 56, 0] < 170 and over[46, 16, 0] > over[46, 56, 0], "a quarter of the live one over it"
     red = (differing[..., 0].astype(int) - differing[..., 1]) > 80
     assert red[46, 16] and red[46, 56] and red[:36].sum() == 0, "where the cube was and where it is, and nowhere else"
-    same = sheet({"front": png(10)}, {"front": jpeg(10)}, 0.5, tile=84)
-    assert same is not None and not ((same[:, 88:, 0].astype(int) - same[:, 88:, 1]) > 80).any()
+    (same,) = overlays({"front": png(10)}, {"front": jpeg(10)}, 0.5, tile=84)
+    assert not ((same[:, 88:, 0].astype(int) - same[:, 88:, 1]) > 80).any()
 
 
 def test_a_camera_without_a_picture_shows_its_start_alone_and_nothing_without_a_start():
-    assert sheet({}, {"front": jpeg(1)}, 0.5) is None
-    dark = sheet({"front": png(10)}, {}, 0.5, tile=84)
-    assert dark is not None
+    assert overlays({}, {"front": jpeg(1)}, 0.5) == ()
+    (dark,) = overlays({"front": png(10)}, {}, 0.5, tile=84)
     np.testing.assert_array_equal(dark[:, :84], decoded(png(10)))
 
 
