@@ -1,7 +1,9 @@
 """Takes every picture of the pages anew, from real runs in a headless Chromium: python docs/screenshots.py [PART...]
 
 Parts: twin (a session on the twin with the shipped model), why (the sample session in the attempt view), arm (states
-that only a real arm has, on the fake controller). Writes docs/screens/*.jpg; takes about four minutes on two cores.
+that only a real arm has, on the fake controller), trials (a plan's scene built again, the cameras' pictures from the
+sample session), demo (a demonstration to be kept or not). Writes docs/screens/*.jpg; takes about five minutes on two
+cores.
 """
 
 from __future__ import annotations
@@ -17,7 +19,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 from playwright.sync_api import Error, sync_playwright
+
+from far_app.recording.reader import read_attempt
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "docs/screens"
@@ -35,7 +41,11 @@ def program(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     process = subprocess.Popen([*FAR, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
-        yield process, next(word for word in process.stdout.readline().split() if word.startswith("http"))
+        said = (word for line in process.stdout for word in line.split())
+        url = next((word.rstrip(";") for word in said if word.startswith("http")), None)
+        if url is None:
+            raise SystemExit(f"far {words[0]} ended without a page (status {process.wait()})")
+        yield process, url
     finally:
         process.send_signal(signal.SIGCONT)
         process.send_signal(signal.SIGINT)
@@ -187,35 +197,106 @@ def why(browser: Any, recordings: Path) -> None:
         camera.page.close()
 
 
-def arm(browser: Any, recordings: Path) -> None:
-    """What only a real arm's session has, on the fake controller."""
+AT_FAKE = ("--robot", "xarm", "--host", "127.0.0.1:15502", "--port", "0")
+
+
+@contextlib.contextmanager
+def fake_controller() -> Iterator[None]:
     fake = subprocess.Popen([*FAR, "fake-xarm"], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert fake.stdout is not None
     fake.stdout.readline()
-    words = ("run", "--robot", "xarm", "--host", "127.0.0.1:15502", "--policy", "test:wander", "--no-scene3d")
     try:
-        with program(*words, "--port", "0", "--no-rerun", "--recordings", str(recordings / "arm")) as (_, url):
-            camera = Camera(browser, url)
-            camera.state("SET THE SCENE")
-            camera.take("set_the_scene", settle=2.0)
-            camera.page.keyboard.press("n")
-            camera.until("#op-state:has-text(' in 3 s'), #op-state:has-text(' in 2 s')")
-            camera.take("countdown", settle=0.2)
-            take_what_goes_by(camera, {"solved": SOLVED}, {"RUNNING": "s"}, settle=1.0)
-            take_what_goes_by(
-                camera, {"start": "[data-state='GOING HOME']"}, {"SET THE SCENE": "n", "RUNNING": "s"}, 0.0
-            )
-            take_what_goes_by(camera, {"arm_running": "[data-state='RUNNING']"}, {"SET THE SCENE": "n"}, 1.0)
-            subprocess.run([*FAR, "fake-xarm", "tell", "error", "31"], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
-            camera.state("FAULT")
-            camera.take("fault")
-            camera.page.close()
+        yield
     finally:
         fake.terminate()
         fake.wait(timeout=20)
 
 
-PARTS: dict[str, Callable[[Any, Path], None]] = {"twin": twin, "why": why, "arm": arm}
+def arm(browser: Any, recordings: Path) -> None:
+    """What only a real arm's session has, on the fake controller."""
+    words = ("run", *AT_FAKE, "--policy", "test:wander", "--no-scene3d", "--no-rerun")
+    with fake_controller(), program(*words, "--recordings", str(recordings / "arm")) as (_, url):
+        camera = Camera(browser, url)
+        camera.state("SET THE SCENE")
+        camera.take("set_the_scene", settle=2.0)
+        camera.page.keyboard.press("n")
+        camera.until("#op-state:has-text(' in 3 s'), #op-state:has-text(' in 2 s')")
+        camera.take("countdown", settle=0.2)
+        take_what_goes_by(camera, {"solved": SOLVED}, {"RUNNING": "s"}, settle=1.0)
+        take_what_goes_by(camera, {"start": "[data-state='GOING HOME']"}, {"SET THE SCENE": "n", "RUNNING": "s"}, 0.0)
+        take_what_goes_by(camera, {"arm_running": "[data-state='RUNNING']"}, {"SET THE SCENE": "n"}, 1.0)
+        subprocess.run([*FAR, "fake-xarm", "tell", "error", "31"], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+        camera.state("FAULT")
+        camera.take("fault")
+        camera.page.close()
+
+
+PLAN = """task = "lift"
+max_attempts = 1
+repetitions = 2
+blind = true
+[[method]]
+name = "patient"
+method = "nr"
+policy = "test:still"
+[[method]]
+name = "restless"
+method = "nr"
+policy = "test:wander"
+[[scene]]
+name = "cube on the left"
+"""
+
+
+def trials(browser: Any, recordings: Path) -> None:
+    """A plan on the fake controller: a scene is to look as the sample session began, its cameras show how that one's
+    second attempt began, with the cube elsewhere."""
+    sample = ROOT / "recordings/sample"
+    plan, rig = recordings / "cubes.toml", recordings / "cell.toml"
+    cell = (ROOT / "hw/rigs/xarm7.toml").read_text().replace("cameras = []", "")
+    for name, picture in read_attempt(sample / "trial_0001/attempt_2.mcap").steps[0].observation.images.items():
+        film = cv2.VideoWriter(str(recordings / f"{name}.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30, (240, 240))
+        for seed in range(30):
+            film.write(seen(picture, seed))
+        film.release()
+        cell += f'[camera.{name}]\ndevice = "file:{recordings}/{name}.avi"\nwidth = 240\nheight = 240\nrate = 30.0\n'
+    plan.write_text(f'{PLAN}recording = "{sample}"\ntrial = 1\n')
+    rig.write_text(cell)
+    words = ("trials", str(plan), *AT_FAKE, "--rig", str(rig), "--no-scene3d", "--no-rerun", "--full-speed")
+    with fake_controller(), program(*words, "--recordings", str(recordings / "trials")) as (_, url):
+        camera = Camera(browser, url)
+        camera.until("#op-scene:has-text('not yet')")
+        camera.page.keyboard.press("n")
+        camera.until("#op-scene .why")
+        camera.take("trials", settle=2.0)
+        camera.page.close()
+
+
+def seen(picture: Any, seed: int) -> np.ndarray:
+    """BGR of a camera's size, with a sensor's noise: a camera that shows one picture for ever counts as lost."""
+    large = cv2.resize(np.asarray(picture), (240, 240), interpolation=cv2.INTER_CUBIC)
+    noisy = large + np.random.default_rng(seed).normal(0, 2, large.shape)
+    return cv2.cvtColor(noisy.clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2BGR)
+
+
+def demo(browser: Any, recordings: Path) -> None:
+    """A person's demonstration, once it has ended."""
+    words = ("demo", "--teleop", *AT_FAKE, "--n", "3", "--recordings", str(recordings / "demo"))
+    with fake_controller(), program(*words, "--out", str(recordings / "demo.hdf5")) as (_, url):
+        camera = Camera(browser, url)
+        camera.state("SET THE SCENE")
+        camera.page.keyboard.press("n")
+        camera.state("TAKEN OVER")
+        for key in ("ArrowUp", "ArrowUp", "j", "j"):
+            camera.page.keyboard.press(key)
+            camera.page.wait_for_timeout(400)
+        camera.page.keyboard.press("s")
+        camera.state("KEEP IT?")
+        camera.take("keep_it", settle=2.0)
+        camera.page.close()
+
+
+PARTS: dict[str, Callable[[Any, Path], None]] = {"twin": twin, "why": why, "arm": arm, "trials": trials, "demo": demo}
 
 
 def main(parts: list[str]) -> int:

@@ -18,12 +18,12 @@ _BUTTONS = (
 class Demonstration:
     """ui.panels.Panel."""
 
-    name, title, height = "demo", "Demonstration", 11.0
+    name, title, height = "demo", "Demonstration", 11.8
 
     def __init__(self) -> None:
         self.items = [
             Item(
-                label=label, box=(left, 5.9, 10.2, 4.3), color=color, action=intent,
+                label=label, box=(left, 6.7, 10.2, 4.3), color=color, action=intent,
                 reason=lambda t, intent=intent: cannot(t, intent), asks=lambda _t, intent=intent: intent,
             )
             for intent, label, color, left in _BUTTONS
