@@ -15,6 +15,7 @@ from ui_process import free_port, wait_until
 
 from far_app.marks import Verdict
 from far_app.recording.reader import read_session
+from ui.keys import Page, keys_of
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="pip install playwright (the dev extra)")
 CHROMIUM = Path("/usr/bin/chromium")
@@ -113,6 +114,35 @@ def test_another_rho_changes_the_flagged_set_at_once_and_as_recorded_takes_it_ba
     assert "what if: ρ 20 %" in page.inner_text("#why-state")
     page.get_by_role("button", name="As recorded").click()
     page.wait_for_selector("#why-state[data-flagged='15']", timeout=SETTLED)
+
+
+def test_another_horizon_is_a_what_if_and_a_key_takes_it_back(page: Any) -> None:
+    box = page.locator(".slot-horizon").locator("xpath=../following-sibling::div[1]").locator("input:visible").last
+    box.fill("16")
+    box.press("Enter")
+    page.wait_for_selector("#why-numbers:has-text('Chunk 50 – 65')", timeout=SETTLED)
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press("r")
+    page.wait_for_selector("#why-numbers:has-text('Chunk 50 – 57')", timeout=SETTLED)
+
+
+def test_arrows_go_through_the_attempts_and_the_ends_are_dead_and_say_so(page: Any) -> None:
+    page.keyboard.press("ArrowDown")
+    page.wait_for_selector("#why-state[data-outcome='SUCCESS'][data-attempt='1']", timeout=SETTLED)
+    last = page.locator("button:has-text('Attempt ▶'):disabled:has-text('the last')")
+    last.wait_for(timeout=SETTLED)
+    page.keyboard.press("ArrowDown")
+    page.get_by_role("button", name="◀ Attempt").click()
+    at(page, 50)
+    assert page.get_attribute("#why-state", "data-attempt") == "0"
+
+
+def test_question_mark_lists_this_pages_keys(page: Any) -> None:
+    page.keyboard.press("?")
+    page.wait_for_selector("#op-keys.on:has-text('adapt again')", timeout=SETTLED)
+    assert len(page.locator("#op-keys kbd").all()) == len(keys_of(Page.WHY))
+    page.keyboard.press("?")
+    page.wait_for_selector("#op-keys:not(.on)", state="attached", timeout=SETTLED)
 
 
 def test_the_operators_word_is_kept_beside_the_recording(page: Any, session: Path) -> None:
