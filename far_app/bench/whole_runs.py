@@ -56,6 +56,8 @@ class Struck:
     first: float | None = None
     """Millimetres from where the arm stood to the first target after that."""
     words: list[str] = field(default_factory=list)
+    family: list[psutil.Process] = field(default_factory=list)
+    """Its processes, once it runs."""
 
     def child(self, module: str) -> psutil.Process:
         for process in psutil.Process(self.process.pid).children(recursive=True):
@@ -165,10 +167,13 @@ def whole_run(blow: Blow, address: str, policy: str) -> dict[str, Any]:
 
 
 def _end(run: Struck) -> None:
-    """With all its processes; its hw server holds the arm and goes by itself."""
+    """With all its processes; its hw server holds the arm and goes by itself, before the next run asks for the arm."""
     if run.process.poll() is None:
         run.process.kill()
         run.process.communicate()
+    _, left = psutil.wait_procs(run.family, timeout=10.0)
+    for process in left:
+        process.kill()
     if run.page is not None:
         run.page.close()
         run.page = None
@@ -214,8 +219,7 @@ def _started(blow: Blow, address: str, policy: str, folder: Path) -> Struck:
     )
     run = Struck(process=process, fake=fake, clock=clock)
     if blow.page:
-        assert process.stdout is not None
-        run.url = process.stdout.readline().split()[-1]
+        run.url = _address_of_page(run)
         run.page = page = RawClient(run.url)
         page.look()
         page.read(START, lambda: any("Rebuild the scene" in str(p.get("content", "")) for p in page.widgets.values()))
@@ -224,6 +228,17 @@ def _started(blow: Blow, address: str, policy: str, folder: Path) -> Struck:
             raise FarError("the page never asked for the scene")
         page.press(ready)
     return run
+
+
+def _address_of_page(run: Struck) -> str:
+    """What the run prints once its page is there. Raises FarError, with its last words, when it ended before."""
+    assert run.process.stdout is not None
+    if words := run.process.stdout.readline().split():
+        return words[-1]
+    said = run.process.communicate(timeout=START)[1].strip().splitlines()[-1:]
+    _end(run)
+    run.fake.close()
+    raise FarError(f"the run ended before its page was there; it said: {''.join(said)}")
 
 
 def next_address(address: str) -> str:
@@ -239,6 +254,7 @@ def _wait_for_motion(run: Struck, recordings: Path) -> None:
             run.page.read(0.1)
         if any(recordings.rglob("*attempt*")):
             time.sleep(1.5)
+            run.family = psutil.Process(run.process.pid).children(recursive=True)
             run.fake.received()
             return
         time.sleep(0.1)
