@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from far_app.recording.inspect import find_session, inspect_session
+from far_app.recording.reader import read_session
 from hw.fake_xarm.control import FakeXArm
 from hw.fake_xarm.protocol import Function
 from tests.hw.conftest import FAKE_PORT, loopback
@@ -173,3 +174,22 @@ def stop_while_the_app_is_frozen(run: Run, fake: FakeXArm) -> None:
 @pytest.mark.slow
 def test_stop_from_the_page_reaches_the_controller_while_the_app_is_frozen(fake: FakeXArm, tmp_path: Path) -> None:
     stop_while_the_app_is_frozen(Run(fake, tmp_path, "--full-speed"), fake)
+
+
+@pytest.mark.slow
+def test_what_fails_on_a_real_arm_is_learnt_from_and_retried_as_in_the_twin(fake: FakeXArm, tmp_path: Path) -> None:
+    """The shipped model on the rehearsal rig, whose cameras show it no cube."""
+    command = [sys.executable, "-c", "import sys; from far_app.cli import main; sys.exit(main(sys.argv[1:]))", "run"]
+    command += ["--rig", "rehearsal", "--host", f"{fake.address}:{FAKE_PORT}", "--accept-differences", "--headless"]
+    command += ["--full-speed", "--trials", "1", "--max-attempts", "2", "--no-rerun", "--recordings", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200, check=False)
+    assert done.returncode == 0, done.stderr
+    first, second = read_session(find_session(tmp_path)).attempts()
+    assert first.outcome is not None and not first.outcome.success
+    assert first.adaptation is not None and first.adaptation.status == "adapted" and first.adaptation.pairs > 0
+    assert {step.policy_version for step in second.steps} == {first.adaptation.version}
+    assert not np.any([step.perturbation for step in first.steps])
+    nudges = np.array([step.perturbation for step in second.steps])
+    assert nudges[:, :3].any() and not nudges[:, 3:].any(), "of x, y and z only"
+    path = np.array([target["pose"][:3] for target in fake.servo_targets()])
+    assert 1.0 < np.linalg.norm(np.diff(path, axis=0), axis=1).max() < STEP

@@ -1,6 +1,6 @@
 """`--policy test:still` and `test:wander`: policies without a network, for tests of processes and of the loop itself.
 
-They learn nothing and succeed at nothing; no documented command uses them.
+They learn nothing and succeed at nothing; a first run on an arm uses them (docs/safety.md).
 """
 
 from __future__ import annotations

@@ -40,7 +40,8 @@ class RunOptions:
     full_speed: bool = False
     """Real arm: the session's first attempt too runs at the policy's own speed."""
     policy: str | None = None
-    """Policy checkpoint; the shipped quickstart model by default."""
+    """Policy checkpoint; the shipped quickstart model by default. Without a network or cameras: test:still stands
+    still, test:wander draws circles."""
     critic: Path | None = None
     """Critic checkpoint; the one beside the policy by default."""
     device: str = "cpu"
