@@ -1,9 +1,18 @@
 """`far fake-xarm`: the fake controller by hand, and what should go wrong with one that runs.
 
-far fake-xarm                                   serve on 127.0.0.1:15502
-far fake-xarm tell error 31                     raise C31
-far fake-xarm tell faults latency=0.03 mute=1   change the link
-far fake-xarm tell cut | cut reset=1 | restart seconds=3 | press code=2 | release | state
+far fake-xarm                                    serve on 127.0.0.1:15502
+far fake-xarm tell error 31                      raise C31
+far fake-xarm tell press 1                       the emergency stop (1, 2 or 3) …
+far fake-xarm tell release                       … and its release
+far fake-xarm tell faults latency=0.03 jitter=0.01         seconds a call takes, and how they vary
+far fake-xarm tell faults stall=0.19 stall_every=10        everything stops for 190 ms every ten seconds
+far fake-xarm tell faults mute=1                 a cut cable
+far fake-xarm tell faults reports_stalled=1      calls are answered, reports do not come
+far fake-xarm tell cut [reset=1]                 every connection ends, by FIN or by RST
+far fake-xarm tell restart [seconds=3]           its power switch
+far fake-xarm tell state                         what it stands at
+
+A fault set to 0 is over.
 """
 
 from __future__ import annotations
@@ -20,9 +29,7 @@ from far_app.errors import ConfigError, FarError
 from far_app.scheduling import MESSAGE_PRIORITY, real_time_from_here
 from hw.fake_xarm.control import CONTROL_OFFSET, FakeXArm
 from hw.fake_xarm.controller import FakeController
-
-PORT = 15502
-"""Where it serves in place of 502, which only root may."""
+from hw.xarm7.settings import FAKE_PORT
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -30,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="far fake-xarm", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--address", default="127.0.0.1", help="loopback address; each has report ports of its own")
-    parser.add_argument("--port", type=int, default=PORT, help="command port; 502 on a real controller")
+    parser.add_argument("--port", type=int, default=FAKE_PORT, help="command port; 502 on a real controller")
     parser.add_argument("tell", nargs="*", help="tell WORD [KEY=VALUE …]: change a running fake")
     options = parser.parse_args(arguments)
     control = options.port + CONTROL_OFFSET
@@ -38,13 +45,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(json.dumps(_tell(FakeXArm(options.address, control), options.tell)))
         return 0
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    print(
-        f"A fake xArm7 controller at {options.address}:{options.port}; run with  "
-        f"far run --robot xarm --host {options.address}:{options.port}\nCtrl-C ends it.", flush=True,
-    )  # fmt: skip
     real_time_from_here(MESSAGE_PRIORITY)  # it stands for another machine: this one's load is not to slow it
-    asyncio.run(_serve(FakeController(options.address, options.port, control)))
+    asyncio.run(_serve(FakeController(options.address, options.port, control, _say_how)))
     return 0
+
+
+def _say_how(address: str, port: int) -> None:
+    print(
+        f"A fake xArm7 controller at {address}:{port}; run with\n"
+        f"  far run --robot xarm --host {address}:{port} --policy test:wander      (no network, no cameras needed)\n"
+        f"  far run --rig rehearsal --host {address}:{port} --accept-differences   (the shipped model, shown test "
+        "pictures)\nCtrl-C ends it.", flush=True,
+    )  # fmt: skip
 
 
 async def _serve(controller: FakeController) -> None:
@@ -61,7 +73,12 @@ def _tell(fake: FakeXArm, words: list[str]) -> dict[str, object]:
     if what in ("error", "press") and rest and "=" not in rest[0]:
         rest = [f"code={rest[0]}"]
     pairs = dict(pair.split("=", 1) for pair in rest if "=" in pair)
-    values = {key: float(value) for key, value in pairs.items()}
+    try:
+        values = {key: float(value) for key, value in pairs.items()}
+    except ValueError as error:
+        raise ConfigError(f"far fake-xarm tell {what} {' '.join(rest)}: {error}; every value is a number") from error
+    if what in ("error", "press") and "code" not in values:
+        raise ConfigError(f"far fake-xarm tell {what} needs a code, as in: far fake-xarm tell {what} 1")
     return fake.tell(do="faults", set=values) if what == "faults" else fake.tell(do=what, **values)
 
 

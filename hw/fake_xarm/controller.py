@@ -13,6 +13,7 @@ import logging
 import socket
 import struct
 import time
+from collections.abc import Callable
 from dataclasses import asdict, fields
 
 import numpy as np
@@ -32,7 +33,11 @@ log = logging.getLogger(__name__)
 class FakeController:
     """Serves until told to end."""
 
-    def __init__(self, address: str, port: int, control_port: int) -> None:
+    def __init__(
+        self, address: str, port: int, control_port: int, serving: Callable[[str, int], None] = lambda *_: None
+    ) -> None:
+        """`serving` is called with address and port once all ports are open."""
+        self._serving = serving
         self.address, self.port, self.control_port = address, port, control_port
         self.arm, self.gripper, self.faults = FakeArm(), FakeGripper(), Faults()
         self.received = ReceivedLog()
@@ -52,6 +57,7 @@ class FakeController:
                 f"the fake controller cannot serve on {self.address} ({error.strerror}); end what listens there, or "
                 "take another loopback address (127.0.0.2 …): the report ports are fixed"
             ) from error
+        self._serving(self.address, self.port)
         await self._ended.wait()
         control.close()
         await self._hang_up(reset=False)
@@ -160,7 +166,8 @@ class FakeController:
                 try:
                     reply = await self._told(json.loads(line))
                 except (ValueError, KeyError, TypeError, AttributeError) as error:
-                    reply = {"error": f"{type(error).__name__}: {error}"}
+                    kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+                    reply = {"error": f"{kind}{error}"}
                 writer.write(json.dumps(reply).encode() + b"\n")
                 await writer.drain()
         writer.close()
@@ -198,7 +205,9 @@ class FakeController:
             case "end":
                 self.end()
             case other:
-                raise ValueError(f"unknown word '{other}'")
+                raise ValueError(
+                    f"unknown word '{other}'; choose one of: error, press, release, faults, cut, restart, state"
+                )
         return self._state()
 
     async def _restart(self, seconds: float) -> None:

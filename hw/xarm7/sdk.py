@@ -20,7 +20,7 @@ from xarm.wrapper import XArmAPI
 
 from far_app.errors import RobotError
 from far_app.scheduling import HARDWARE_PRIORITY, real_time_from_here
-from hw.xarm7.settings import XArmSettings
+from hw.xarm7.settings import FAKE_PORT, XArmSettings
 
 log = logging.getLogger(__name__)
 
@@ -70,9 +70,12 @@ def connect(settings: XArmSettings, report: Report, timeout: float) -> XArmAPI:
         )
     api = made[0]
     if isinstance(api, Exception):
+        here = settings.address.startswith("127.") and settings.port != FAKE_PORT
         raise RobotError(
             f"no xArm controller at {where} ({api}); check its power and the cable, that this machine has an address "
             "in the same network, and the address in the rig file or after --host"
+            + f" (a fake one (far fake-xarm) listens on port {FAKE_PORT}: {settings.address}:{FAKE_PORT})"
+            * here
         )
     api.set_timeout(timeout)
     link = stream(api)

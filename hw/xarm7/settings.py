@@ -12,6 +12,8 @@ RANGES = {
     "g2": {"open": (0.0, 84.0), "closed": (0.0, 84.0), "speed": (15.0, 225.0), "force": (1.0, 100.0)},
 }
 """What each hand takes (vendor)."""
+FAKE_PORT = 15502
+"""Where the fake controller (hw/fake_xarm/) serves in place of 502, which only root may."""
 REACH = 0.5
 """Metres from the flange within which a tool centre point or a load's centre can lie: more was meant in millimetres."""
 

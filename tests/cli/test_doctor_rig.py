@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from far_app.cli import main
+from far_app.errors import FarError
 from hw.fake_xarm.__main__ import main as fake_xarm
 from hw.fake_xarm.control import FakeXArm
 from hw.fake_xarm.protocol import Function
@@ -74,5 +76,29 @@ def test_a_running_fake_is_told_from_the_command_line(fake: FakeXArm, capsys) ->
     assert fake_xarm(["--address", fake.address, "tell", "error", "31"]) == 0
     assert fake.state()["error"] == 31
     assert fake_xarm(["--address", fake.address, "tell", "faults", "latency=0.01"]) == 0
-    with pytest.raises(Exception, match="unknown fault 'speed'"):
-        fake_xarm(["--address", fake.address, "tell", "faults", "speed=1"])
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["faults", "speed=1"], "unknown fault 'speed'; choose one of: jitter, latency, mute, reports_stalled, stall"),
+        (["faults", "mute=yes"], "could not convert string to float: 'yes'; every value is a number"),
+        (["error"], "needs a code, as in: far fake-xarm tell error 1"),
+        (["explode"], "unknown word 'explode'; choose one of: error, press, release, faults, cut, restart, state"),
+    ],
+)
+def test_what_a_fake_does_not_understand_is_one_line(fake: FakeXArm, words: list[str], says: str) -> None:
+    with pytest.raises(FarError, match=re.escape(says)):
+        fake_xarm(["--address", fake.address, "tell", *words])
+
+
+def test_a_fake_on_ports_that_are_taken_never_says_that_it_serves(fake: FakeXArm, capsys) -> None:
+    with pytest.raises(FarError, match="cannot serve on"):
+        fake_xarm(["--address", fake.address])
+    assert "A fake xArm7 controller at" not in capsys.readouterr().out
+
+
+def test_a_controller_looked_for_on_this_machine_at_the_real_ones_port_tells_of_the_fakes(fake: FakeXArm, capsys):
+    assert main(["doctor", "--rig", "xarm7", "--host", fake.address]) == 1
+    told = capsys.readouterr().out
+    assert f"a fake one (far fake-xarm) listens on port {FAKE_PORT}: {fake.address}:{FAKE_PORT}" in told

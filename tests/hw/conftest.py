@@ -29,12 +29,12 @@ from hw.lockstep import LockstepRobot
 from hw.rig import RIGS, load_rig
 from hw.twin import TwinPlant
 from hw.twin_view import TwinView
+from hw.xarm7.settings import FAKE_PORT
 
 RIG, TASK = load_rig("twin"), task("lift")
 XARM = load_rig("xarm7")
 XARM = replace(XARM, home=replace(XARM.home, speed=0.25, rotation_speed=1.2))
 """The shipped rig, in a hurry to get home."""
-FAKE_PORT = 15502
 _addresses = itertools.count(1)
 
 
