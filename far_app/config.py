@@ -216,6 +216,9 @@ class TaskConfig:
     """How to let go before homing."""
     retreat: tuple[float, float, float] = (0.0, 0.0, 0.10)
     """Retreat before the path home, metres, base frame."""
+    path: tuple[tuple[float, float, float], ...] = ()
+    """Points to pass through after the retreat, in this order, metres from the start pose, base frame: for a task with
+    something in the straight way home. Empty: straight."""
     cameras: tuple[str, ...] = ("front", "wrist")
     front: tuple[tuple[float, float, float], tuple[float, float, float]] = ((0.62, 0.0, 1.42), (-0.03, 0.0, 0.93))
     """Where the twin's front camera stands and what it looks at, metres, in the twin's world."""

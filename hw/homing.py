@@ -9,6 +9,7 @@ Stepped once a servo period by hw/controller.py; the scene is never touched, and
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from dataclasses import dataclass
@@ -113,16 +114,22 @@ class Homing:
         self._seconds = 0.0
         self._trail: deque[Pose] = deque()
         self._retreat_to = self._retreat_position(measured)
+        self._left = self._way()
         release = {"open": Phase.RELEASE, "lower_then_open": Phase.LOWER, "ask": Phase.ASK}[task.release]
         is_open = measured.gripper > OPEN_ENOUGH and gripper < 0.0
         self._enter(Phase.RELEASE if is_open else release)
         retreat = Pose(position=self._retreat_to, quaternion=measured.eef.quaternion)
-        for start, end in ((measured.eef, retreat), (retreat, self.start)):
+        for start, end in itertools.pairwise((measured.eef, retreat, *self._left)):
             self.failed = self.failed or breach(Leg.plan(start, end, rig.home, rig.safety), rig.safety)
 
     def _retreat_position(self, measured: Measured) -> np.ndarray:
         limits = self._rig.safety
         return np.clip(measured.eef.position + np.array(self._task.retreat), limits.box_min, limits.box_max)
+
+    def _way(self) -> list[Pose]:
+        """Where to go after the retreat, the start pose last."""
+        points = (self.start.position + np.array(offset) for offset in self._task.path)
+        return [*(Pose(position=point, quaternion=self.start.quaternion) for point in points), self.start]
 
     @property
     def waiting(self) -> str:
@@ -134,7 +141,11 @@ class Homing:
     def progress(self) -> float:
         low, high = SHARE[self.phase]
         whole = self._leg.seconds if self._leg is not None else SETTLED
-        return low + (high - low) * min(1.0, self._seconds / whole)
+        share = min(1.0, self._seconds / whole)
+        if self.phase is Phase.RETURN:
+            legs = len(self._task.path) + 1
+            share = (legs - len(self._left) + share) / legs
+        return low + (high - low) * share
 
     def released(self) -> None:
         """The operator answered: the hand may open."""
@@ -166,7 +177,11 @@ class Homing:
             above = Pose(position=self._retreat_to, quaternion=commanded.quaternion)
             return self._travel(commanded, above, Phase.RETURN)
         if self.phase is Phase.RETURN:
-            return self._travel(commanded, self.start, Phase.SETTLE)
+            last = len(self._left) == 1
+            wish = self._travel(commanded, self._left[0], Phase.SETTLE if last else Phase.RETURN)
+            if self._leg is None and not last:
+                self._left.pop(0)
+            return wish
         self._settle(measured, period)
         return Along(pose=self.start)
 

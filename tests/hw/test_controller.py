@@ -254,6 +254,39 @@ def test_home_opens_retreats_and_returns_smoothly() -> None:
     assert max(speeds) <= RIG.home.speed * 1.02
 
 
+def test_the_way_home_passes_through_the_tasks_points_and_goes_on_to_the_next_after_a_hold() -> None:
+    path = ((0.05, -0.10, 0.15), (-0.10, -0.10, 0.05))
+    arm = away(task=replace(TASK, path=path))
+    points = [START.position + np.array(offset) for offset in path]
+    first = len(arm.commanded)
+    arm.controller.request(Home(), arm.now)
+    arm.beat_until(lambda: math.dist(arm.measured.eef.position, points[0]) < 1e-3)
+    arm.beat_until(lambda: math.dist(arm.measured.eef.position, points[0]) > 0.05)
+    arm.tick(60)
+    held, progress = arm.now, list[float]()
+
+    def at_home() -> bool:
+        progress.append(arm.controller.status().homing_progress)
+        return arm.controller.status().at_home
+
+    arm.beat_until(at_home)
+    assert min(np.diff(progress)) >= 0.0, "whoever watches sees it come nearer"
+    way = np.array([pose.position for pose in arm.commanded[first:]])
+    nearest = [np.linalg.norm(way - point, axis=1) for point in points]
+    assert max(distances.min() for distances in nearest) < 1e-3
+    assert nearest[0].argmin() < held * arm.servo_hz - first < nearest[1].argmin(), "the first is not visited again"
+    assert math.dist(arm.measured.eef.position, START.position) < 1e-3
+    speeds = np.linalg.norm(np.diff(way, axis=0), axis=1) * arm.servo_hz
+    assert speeds.max() <= RIG.home.speed * 1.02
+
+
+def test_a_point_on_the_way_home_outside_the_box_is_refused_before_anything_moves() -> None:
+    arm = away(task=replace(TASK, path=((0.0, 1.0, 0.0),)))
+    with pytest.raises(RobotError, match="the path home leaves the workspace box"):
+        arm.controller.request(Home(), arm.now)
+    assert arm.mode is not RobotMode.HOMING
+
+
 def test_homing_at_home_with_an_open_hand_takes_no_detour() -> None:
     arm = Arm()
     arm.controller.request(Home(), arm.now)
