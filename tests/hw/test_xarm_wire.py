@@ -19,6 +19,7 @@ from hw.fake_xarm.control import FakeXArm
 from hw.fake_xarm.protocol import Function
 from hw.rig import at_address, load_rig
 from hw.xarm7.plant import XArmPlant
+from hw.xarm7.sdk import connect
 from tests.hw.cell import BACK, FORWARD, TASK, Cell, rig_at, steps
 from tests.hw.conftest import FAKE_PORT, XArmBench, loopback
 
@@ -195,6 +196,27 @@ def test_a_controller_that_never_answers_is_an_error_in_time() -> None:
         XArmPlant(replace(rig, xarm=replace(rig.xarm, connect_timeout=1.0)), TASK)
     assert time.monotonic() - began < 5
     listener.close()
+
+
+def test_a_unix_socket_that_lies_about_is_never_taken_for_the_controller() -> None:
+    """The SDK would prefer it to whatever address it was given."""
+    listener = socket.create_server((loopback(), 0))
+    address, port = listener.getsockname()
+    trap = Path(f"/tmp/xarmcontroller_uds_{port}")
+    with listener, socket.socket(socket.AF_UNIX) as beside:
+        beside.bind(str(trap))
+        beside.listen()
+        beside.setblocking(False)
+        listener.settimeout(5.0)
+        settings = replace(load_rig("xarm7").xarm, address=address, port=port, connect_timeout=1.0)
+        try:
+            with pytest.raises(RobotError, match="took the connection but did not answer"):
+                connect(settings, "none", 0.2)
+            listener.accept()[0].close()
+            with pytest.raises(BlockingIOError):
+                beside.accept()
+        finally:
+            trap.unlink()
 
 
 def test_no_controller_at_all_says_where_it_was_looked_for() -> None:
