@@ -45,7 +45,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--device", default="cpu", help="cpu or cuda, for the engine")
     parser.add_argument("--recordings", type=Path, default=Path("recordings"))
     parser.add_argument(
-        "--rig", help="check this rig file (name or path) instead, and its controller where one answers"
+        "--rig", help="check this rig file (name or path) instead, its cameras, and its controller where one answers"
     )
     parser.add_argument("--host", default="", help="ADDRESS[:PORT] of the controller, over the rig file's")
     options = parser.parse_args(list(arguments))

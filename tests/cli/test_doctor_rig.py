@@ -67,6 +67,34 @@ def test_a_g2_is_asked_as_one(fake: FakeXArm, tmp_path: Path, capsys) -> None:
     assert line.startswith("ok   gripper    g2 at 8"), "millimetres"
 
 
+def camera_lines(tmp_path: Path, device: str, capsys) -> list[str]:
+    """What a doctor says of a rig with this camera, at an address where no controller is."""
+    rig = tmp_path / "mine.toml"
+    text = (RIGS / "xarm7.toml").read_text().replace("cameras = []", "")
+    rig.write_text(f'{text}\n[camera.front]\ndevice = "{device}"\nwidth = 1344\nheight = 376\neye = "left"\n')
+    assert main(["doctor", "--rig", str(rig), "--host", f"{loopback()}:{FAKE_PORT}"]) == 1
+    return [line for line in capsys.readouterr().out.splitlines() if line[5:].startswith("camera ")]
+
+
+def test_a_camera_is_looked_through(tmp_path: Path, capsys) -> None:
+    (line,) = camera_lines(tmp_path, "synthetic", capsys)
+    assert line.startswith("ok   camera     1344×376, ")
+    assert "of 60 asked for; front: left eye, largest centred square" in line
+
+
+@pytest.mark.parametrize(
+    ("device", "says"),
+    [
+        ("/dev/no-such-camera", "/dev/no-such-camera cannot be opened; is it plugged in"),
+        ("synthetic:unplugged@0+9", "is unplugged; plug it in"),
+        ("synthetic:frozen@0.2+9", "frozen  → give it a USB controller of its own"),
+    ],
+)
+def test_a_camera_that_gives_nothing_or_too_little_is_named(device: str, says: str, tmp_path: Path, capsys) -> None:
+    (line,) = camera_lines(tmp_path, device, capsys)
+    assert line.startswith("BAD  camera") and says in line
+
+
 def test_no_controller_is_one_line(capsys) -> None:
     assert main(["doctor", "--rig", "xarm7", "--host", f"{loopback()}:{FAKE_PORT}"]) == 1
     assert "BAD  controller no xArm controller at" in capsys.readouterr().out
