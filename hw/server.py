@@ -233,7 +233,8 @@ def main(arguments: list[str] | None = None) -> int:
 def _for_a_person(words: dict[str, object], address: str) -> str:
     if "error" in words:
         return f"far: {words['error']}"
-    return f"Ready at {address}: on the other machine say  far run --hw {address} …\nCtrl-C ends it; the arm is held."
+    there = address.replace("//0.0.0.0:", "//THIS-MACHINE:")
+    return f"Ready at {address}: on the other machine say  far run --hw {there} …\nCtrl-C ends it; the arm is held."
 
 
 if __name__ == "__main__":

@@ -35,6 +35,7 @@ from far_app.types import Ack, Observation, RobotMode, RobotStatus, Target
 from far_app.wire import pack, unpack
 from hw.fake_xarm.control import FakeXArm
 from hw.rig import load_rig
+from hw.server import _for_a_person
 from tests.hw.conftest import FAKE_PORT, loopback
 from tests.recording.values import pose
 from tests.test_real_arm import STEP, Run, stop_while_the_app_is_frozen
@@ -142,6 +143,13 @@ def test_without_keys_any_address_but_loopback_is_refused_on_both_sides(
     for command in (["hw-server", "--bind", address], ["run", "--headless", "--policy", "test:still", "--hw", address]):
         assert main(command) == 2
         assert "without keys anybody there could move the arm" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("bound", "said"), [("tcp://0.0.0.0:5600", "tcp://THIS-MACHINE:5600"), ("tcp://10.0.0.9:1", "tcp://10.0.0.9:1")]
+)
+def test_a_server_that_is_ready_says_what_to_type_on_the_other_machine(bound: str, said: str):
+    assert f"far run --hw {said} …" in _for_a_person({"ready": True}, bound)
 
 
 @pytest.mark.parametrize("address", ["192.168.1.9:5600", "tcp://127.0.0.1", "tcp://:5600", "ipc://x", "tcp://[::1]:56"])

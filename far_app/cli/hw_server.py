@@ -25,6 +25,7 @@ class ServerOptions:
     keys: Path | None = None
     """Folder of the CURVE keys (see far keys); any address but loopback needs them."""
     task: str = "lift"
+    """The task of the far run to come: its release, its way home, its rate."""
     robot: Literal["twin", "xarm"] | None = None
     """twin simulates, xarm is a real xArm7; the rig file's own when it is not given."""
     rig: str | None = None

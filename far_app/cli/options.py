@@ -27,6 +27,7 @@ class RunOptions:
     method: str = "far"
     """How to retry: dp, nr, perturb, fcpa, far, bgr, rerank, negative-guidance."""
     task: str = "lift"
+    """lift, stack, door, bread, can or square."""
     robot: Literal["twin", "xarm"] | None = None
     """twin simulates, xarm is a real xArm7; the rig file's own when it is not given."""
     rig: str | None = None

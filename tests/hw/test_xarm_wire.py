@@ -248,6 +248,19 @@ def test_a_tool_that_differs_is_set_before_servo_mode(fake: FakeXArm) -> None:
     plant.close()
 
 
+def test_no_target_is_sent_to_a_controller_that_does_not_report_servo_mode_and_a_state_that_follows(
+    fake: FakeXArm,
+) -> None:
+    fake.tell(do="set", name="emergency", value=1)  # its motors stay off, and it does not say why
+    fake.received()
+    try:
+        with pytest.raises(RobotError, match=r"did not enter servo mode within 2 s \(it reports mode 1, state 4"):
+            XArmPlant(rig_at(fake, FAKE_PORT), TASK)
+        assert not fake.servo_targets()
+    finally:
+        fake.tell(do="set", name="emergency", value=0)
+
+
 def test_a_rig_faster_than_its_servo_step_is_refused() -> None:
     rig = load_rig("xarm7")
     with pytest.raises(ConfigError, match=r"servo ticks of at most 0\.0025 m at 100 Hz allow 0\.25 m/s"):
