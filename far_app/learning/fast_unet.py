@@ -138,9 +138,8 @@ class FastUnet:
 
     def pull_back(self, gradients: Sequence[Tensor]) -> Float[Tensor, "P"]:
         """The gradient on the module's weights, flat, from the gradients on `leaves`. Once for each refresh."""
-        # Of a scalar: given `grad_outputs` autograd first imports a compiler (see FlatAdamW).
-        along = torch.stack([(m * g).sum() for m, g in zip(self._arranged, gradients, strict=True)]).sum()
-        found = torch.autograd.grad(along, self.parameters, retain_graph=True, materialize_grads=True)
+        end = _Given.apply(gradients, *self._arranged)
+        found = torch.autograd.grad(end, self.parameters, retain_graph=True, materialize_grads=True)  # type: ignore[arg-type]
         return torch.cat([g.flatten() for g in found])
 
     def _blocks(self) -> list[Any]:
@@ -208,6 +207,20 @@ class FastUnet:
             x = _affine(taps(x), next(matrices), next(matrices)).reshape(batch, 2 * length, -1)
         x = _convolved(x, u.out[0], matrices)
         return _affine(x, next(matrices), next(matrices))
+
+
+class _Given(torch.autograd.Function):
+    """A scalar whose gradients are given. Handed to autograd itself, as `grad_outputs`, they would first make it import
+    a compiler (see FlatAdamW)."""
+
+    @staticmethod
+    def forward(ctx, gradients: Sequence[Tensor], *matrices: Tensor) -> Tensor:  # noqa: ANN001
+        ctx.gradients = gradients
+        return matrices[0].new_zeros(())
+
+    @staticmethod
+    def backward(ctx, _: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN001
+        return (None, *ctx.gradients)
 
 
 def _conv(block: Any, length: int) -> list[Tensor]:
