@@ -177,7 +177,7 @@ def check_outside(before: Pose, after: Pose, new_spin: np.ndarray, spin: np.ndar
     law(not still or math.hypot(*new_spin) <= math.hypot(*spin) + 1e-6, "outside", "turning on the spot")
 
 
-@settings(FAST, max_examples=5000)
+@settings(FAST, max_examples=8000)
 @given(seed=SEEDS)
 def test_from_inside_motion_stays_inside_and_under_every_limit(seed: int) -> None:
     check_life(seed, inside=True)
