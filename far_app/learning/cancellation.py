@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -35,13 +35,9 @@ def abandonable(call: Callable[[], T], cancelled: Cancelled) -> T:
             result.set_exception(error)
 
     threading.Thread(target=work, name="adaptation-engine", daemon=True).start()
-    while True:
-        try:
-            return result.result(timeout=_LOOK)
-        except TimeoutError:
-            if result.done():
-                raise
-            check(cancelled)
+    while not wait((result,), timeout=_LOOK).done:
+        check(cancelled)
+    return result.result()
 
 
 _LOOK = 0.02
