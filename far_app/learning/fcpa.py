@@ -21,7 +21,7 @@ from far_app.errors import ConfigError, PolicyError
 from far_app.learning.adamw import FlatAdamW, guarded_step
 from far_app.learning.cancellation import Cancelled
 from far_app.learning.pairs import Pairs
-from far_app.learning.preference import Demonstrations, Noising, Objective, draw
+from far_app.learning.preference import Cloning, Demonstrations, Noising, Objective, draw
 from far_app.learning.trainable import Arrange, trainable
 from far_app.types import AdaptationStep
 
@@ -73,6 +73,9 @@ def adapt(
     fixed = draw(rng, states, FIXED_DRAWS, noising.steps, pairs.negatives)
     optimiser = FlatAdamW(runner.parameters, lr=config.lr)
     start = optimiser.weights.clone()
+    cloning = None
+    if config.guard == "bc" and demonstrations is not None:
+        cloning = Cloning(demonstrations=demonstrations, weight=config.bc_weight, rng=rng)
     history: list[AdaptationStep] = []
 
     def report(step: int) -> AdaptationStep:
@@ -93,10 +96,7 @@ def adapt(
             if config.guard == "scale":
                 guarded_step(optimiser, *objective.gradients(fresh))
             else:
-                gradient = objective.gradient(fresh)
-                if config.guard == "bc" and demonstrations is not None:
-                    gradient.add_(objective.cloning_gradient(demonstrations, rng), alpha=config.bc_weight)
-                optimiser.step(gradient)
+                optimiser.step(objective.gradient(fresh, cloning))
             runner.refresh()
             winner = report(step).winner_error
             if config.guard in {"stop", "scale"} and winner > limit:

@@ -53,6 +53,15 @@ class Demonstrations:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Cloning:
+    """The bc guard's term of the loss: its weight, what is cloned, and what picks the minibatches."""
+
+    demonstrations: Demonstrations
+    weight: float
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, kw_only=True)
 class Draws:
     """D draws of (k, ε) for each of S states."""
 
@@ -158,10 +167,12 @@ class Objective:
         loss = preference_loss(winner, loser, self.config, pairs.weights) / len(pairs)
         return float(loss), float(winner.mean()), float(loser.mean())
 
-    def gradient(self, draws: Draws) -> Float[Tensor, "P"]:
-        """The loss's gradient, flat."""
+    def gradient(self, draws: Draws, cloning: Cloning | None = None) -> Float[Tensor, "P"]:
+        """The loss's gradient, flat; with that of cloning added."""
         total = self.zeros()
         self.gather(draws, total, total)
+        if cloning is not None:
+            self.gather_cloning(cloning, total)
         return self.denoiser.pull_back(total)
 
     def gradients(self, draws: Draws) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
@@ -207,8 +218,9 @@ class Objective:
         for total, gradient in zip(totals, gradients, strict=True):
             total.add_(gradient)
 
-    def cloning_gradient(self, demonstrations: Demonstrations, rng: np.random.Generator) -> Float[Tensor, "P"]:
-        """Gradient of the behaviour-cloning loss on a minibatch of demonstration chunks."""
+    def gather_cloning(self, cloning: Cloning, total: list[Tensor]) -> None:
+        """Add the gradient of the weighted behaviour-cloning loss on a minibatch of demonstration chunks."""
+        demonstrations, rng = cloning.demonstrations, cloning.rng
         rows = torch.from_numpy(rng.integers(len(demonstrations.chunks), size=BC_BATCH))
         chunks = demonstrations.chunks[rows]
         draws = draw(rng, BC_BATCH, 1, self.noising.steps, chunks)
@@ -216,6 +228,4 @@ class Objective:
             self.denoiser, self.noising, chunks, demonstrations.features[rows], draws, torch.arange(BC_BATCH),
             self.config, self.cancelled,
         )  # fmt: skip
-        totals = self.zeros()
-        self.accumulate(totals, errors, chunks.new_full((BC_BATCH,), 1 / BC_BATCH), 1)
-        return self.denoiser.pull_back(totals)
+        self.accumulate(total, errors, chunks.new_full((BC_BATCH,), cloning.weight / BC_BATCH), 1)

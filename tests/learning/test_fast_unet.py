@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from far_app.learning.fast_unet import FastUnet, arrangeable, mish
+from far_app.learning.fast_unet import FastUnet, arrangeable
 from far_app.learning.trainable import PlainDenoiser, trainable
 from far_app.learning.unet import ConditionalUnet1d
 
@@ -59,13 +59,3 @@ def test_what_it_cannot_arrange_runs_plainly():
     assert arrangeable(unet((16, 32, 64)), 6) is None
     assert isinstance(trainable(unet((16, 32), kernel=5), 8), PlainDenoiser)
     assert isinstance(trainable(unet((16, 32)), 8), FastUnet)
-
-
-def test_mish_and_its_slope_are_torchs_far_out_too():
-    x = torch.cat([torch.linspace(-60, 60, 5000), torch.tensor([-1e4, 1e4])]).requires_grad_()
-    expected = torch.nn.functional.mish(x)
-    (slope,) = torch.autograd.grad(expected.sum(), x)
-    found = mish(x)
-    (own,) = torch.autograd.grad(found.sum(), x)
-    assert torch.allclose(found, expected, atol=1e-5, rtol=1e-5)
-    assert torch.allclose(own, slope, atol=1e-5)
