@@ -1,7 +1,9 @@
 """What a convolutional layer does besides its product, each in one pass over memory: on CPU, float32, without Python's
 lock.
 
-    norm_mish       GroupNorm → Mish [→ FiLM]        taps    every step beside its neighbours, ready for the product
+    norm_mish    GroupNorm → Mish [→ FiLM]
+    taps         every step beside its neighbours, ready for the product
+    two_step     a convolution over two steps as one matrix
 
 torch does the same in eight passes, each with a tensor of its own. Compiled once, when first imported on a machine, and
 kept in __pycache__ (a few seconds). The layers (layers.py) run them; tests hold them to torch's own operations.
@@ -153,14 +155,18 @@ def norm_mish_back(g, x, scale, offset, mean, rstd, film, at, to_x, to_scale, to
 
 @njit("void(f4[:,:,::1], i8, f4[:,:,:,::1])", **FAST)
 def taps(x, stride, out):  # noqa: ANN001, ANN201
-    """out[b, i] = x[b, i·stride − 1 … i·stride + 1]; zeros past the ends. x (B, T, C), out (B, T/stride, 3, C)."""
+    """out[b, i] = x[b, i·stride − 1 … i·stride + 1]; zeros past the ends. x (B, T, C), out (B, T/stride, C, 3)."""
     batch, length, channels = x.shape
+    nothing = np.zeros(channels, f32)
     for b in range(batch):
         for i in range(out.shape[1]):
-            for j in range(3):
-                t = i * stride + j - 1
-                for c in range(channels):
-                    out[b, i, j, c] = x[b, t, c] if 0 <= t < length else ZERO
+            t = i * stride
+            before = x[b, t - 1] if t > 0 else nothing
+            after = x[b, t + 1] if t + 1 < length else nothing
+            for c in range(channels):
+                out[b, i, c, 0] = before[c]
+                out[b, i, c, 1] = x[b, t, c]
+                out[b, i, c, 2] = after[c]
 
 
 @njit("void(f4[:,:,:,::1], i8, f4[:,:,::1])", **FAST)
@@ -170,8 +176,35 @@ def taps_back(g, stride, to_x):  # noqa: ANN001, ANN201
     for b in range(batch):
         to_x[b] = ZERO
         for i in range(g.shape[1]):
-            for j in range(3):
-                t = i * stride + j - 1
-                if 0 <= t < length:
-                    for c in range(channels):
-                        to_x[b, t, c] += g[b, i, j, c]
+            t = i * stride
+            for c in range(channels):
+                to_x[b, t, c] += g[b, i, c, 1]
+            if t > 0:
+                for c in range(channels):
+                    to_x[b, t - 1, c] += g[b, i, c, 0]
+            if t + 1 < length:
+                for c in range(channels):
+                    to_x[b, t + 1, c] += g[b, i, c, 2]
+
+
+@njit("void(f4[:,:,::1], f4[:,::1])", **FAST)
+def two_step(weight, out):  # noqa: ANN001, ANN201
+    """A kernel-3 convolution (O, C, 3) over two steps as one matrix (2O, 2C): [[W₁ W₂], [W₀ W₁]]."""
+    outer, inner, _ = weight.shape
+    for o in range(outer):
+        for c in range(inner):
+            out[o, c] = weight[o, c, 1]
+            out[o, inner + c] = weight[o, c, 2]
+            out[outer + o, c] = weight[o, c, 0]
+            out[outer + o, inner + c] = weight[o, c, 1]
+
+
+@njit("void(f4[:,::1], f4[:,:,::1])", **FAST)
+def two_step_back(g, to_weight):  # noqa: ANN001, ANN201
+    """The gradient of `two_step`, given the matrix's."""
+    outer, inner, _ = to_weight.shape
+    for o in range(outer):
+        for c in range(inner):
+            to_weight[o, c, 0] = g[outer + o, c]
+            to_weight[o, c, 1] = g[o, c] + g[outer + o, inner + c]
+            to_weight[o, c, 2] = g[o, inner + c]

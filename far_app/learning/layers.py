@@ -23,25 +23,26 @@ Kept = list[Any]
 
 @dataclass(frozen=True)
 class Affine:
-    """x W + b, of rows."""
+    """x Wᵀ + b, of rows; W is (O, C)."""
 
     at: int
 
     def forward(self, rows: Float[Tensor, "N C"], m: Sequence[Tensor], kept: Kept | None) -> Float[Tensor, "N O"]:
         if kept is not None:
             kept.append(rows)
-        return torch.addmm(m[self.at + 1], rows, m[self.at])
+        return torch.addmm(m[self.at + 1], rows, m[self.at].T)
 
     def back(
         self, g: Float[Tensor, "N O"], m: Sequence[Tensor], kept: Kept, into: list[Tensor | None]
     ) -> Float[Tensor, "N C"]:
-        into[self.at], into[self.at + 1] = kept.pop().T @ g, g.sum(0)
-        return g @ m[self.at].T
+        into[self.at], into[self.at + 1] = g.T @ kept.pop(), g.sum(0)
+        return g @ m[self.at]
 
 
 @dataclass(frozen=True)
 class Taps:
-    """A product over every step (or every `stride`-th) and its neighbours: a convolution of three taps."""
+    """A product over every step (or every `stride`-th) and its neighbours: a convolution of three taps, whose weights
+    (O, C, 3) are the matrix as they are."""
 
     affine: Affine
     stride: int = 1
@@ -54,15 +55,15 @@ class Taps:
         self, g: Float[Tensor, "B T2 O"], m: Sequence[Tensor], kept: Kept, into: list[Tensor | None]
     ) -> Float[Tensor, "B T C"]:
         batch, length, _ = g.shape
-        beside = self.affine.back(g.flatten(0, 1), m, kept, into).view(batch, length, 3, -1)
-        to_x = beside.new_empty(batch, length * self.stride, beside.shape[3])
+        beside = self.affine.back(g.flatten(0, 1), m, kept, into).view(batch, length, -1, 3)
+        to_x = beside.new_empty(batch, length * self.stride, beside.shape[2])
         kernels.taps_back(beside.numpy(), self.stride, to_x.numpy())
         return to_x
 
 
 @dataclass(frozen=True)
 class Whole:
-    """A product over all steps at once: [x₀ x₁] W."""
+    """A product over all steps at once: [x₀ x₁] Wᵀ."""
 
     affine: Affine
 
@@ -92,7 +93,7 @@ class Convolved:
     ) -> Float[Tensor, "B T O"]:
         x = self.product.forward(x, m, kept)
         scale, offset = m[self.at], m[self.at + 1]
-        if not _by_kernels(x):
+        if not by_kernels(x):
             return self._plainly(x, film, scale, offset)
         y, mean = torch.empty_like(x), x.new_empty(len(x), self.groups)
         rstd = torch.empty_like(mean)
@@ -223,19 +224,20 @@ class Layers:
         return into, to_film
 
 
-def _by_kernels(x: Tensor) -> bool:
+def by_kernels(x: Tensor) -> bool:
+    """Whether the kernels take it."""
     return x.device.type == "cpu" and x.dtype is torch.float32
 
 
 def _taps(x: Float[Tensor, "B T C"], stride: int) -> Float[Tensor, "B T2 3C"]:
     batch, length, channels = x.shape
-    out = x.new_empty(batch, length // stride, 3, channels)
-    if _by_kernels(x):
+    out = x.new_empty(batch, length // stride, channels, 3)
+    if by_kernels(x):
         kernels.taps(x.numpy(), stride, out.numpy())
     else:
         before, after = x[:, stride - 1 : length - 1 : stride], x[:, 1::stride]
-        out[:, 0, 0] = 0.0
-        out[:, 1:, 0], out[:, :, 1] = before, x[:, ::stride]
-        out[:, -1, 2] = 0.0
-        out[:, : after.shape[1], 2] = after
+        out[:, 0, :, 0] = 0.0
+        out[:, 1:, :, 0], out[..., 1] = before, x[:, ::stride]
+        out[:, -1, :, 2] = 0.0
+        out[:, : after.shape[1], :, 2] = after
     return out.flatten(2)

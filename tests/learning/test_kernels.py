@@ -50,15 +50,15 @@ def test_taps_are_what_a_convolution_sees_and_their_gradient_goes_back(stride, l
     g = torch.Generator().manual_seed(0)
     x, weight = torch.randn(3, length, 5, generator=g).requires_grad_(), torch.randn(7, 5, 3, generator=g)
     expected = functional.conv1d(x.transpose(1, 2), weight, stride=stride, padding=1).transpose(1, 2)
-    beside = torch.empty(3, length // stride, 3, 5)
+    beside = torch.empty(3, length // stride, 5, 3)
     kernels.taps(*arrays(x), stride, *arrays(beside))
-    matrix = weight.permute(2, 1, 0).reshape(15, 7)
-    assert torch.allclose(beside.flatten(2) @ matrix, expected, atol=1e-5)
+    matrix = weight.flatten(1)
+    assert torch.allclose(beside.flatten(2) @ matrix.T, expected, atol=1e-5)
 
     gradient = torch.randn(expected.shape, generator=g)
     (slope,) = torch.autograd.grad(expected, x, gradient)
     to_x = torch.empty_like(x)
-    kernels.taps_back(*arrays((gradient @ matrix.T).view(3, -1, 3, 5)), stride, *arrays(to_x))
+    kernels.taps_back(*arrays((gradient @ matrix).view(3, -1, 5, 3)), stride, *arrays(to_x))
     assert torch.allclose(to_x, slope, atol=1e-5)
 
 

@@ -84,6 +84,11 @@ def settings(precision: str, threads: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def by_tap(matrix: Float[np.ndarray, "O C3"]) -> Float[np.ndarray, "O 3C"]:
+    """The columns tap by tap, as `_Builder._taps` lays the inputs side by side; FastUnet has them channel by channel."""
+    return np.ascontiguousarray(matrix.reshape(len(matrix), -1, 3).swapaxes(1, 2)).reshape(len(matrix), -1)
+
+
 class _Builder:
     """FastUnet.run, operation by operation."""
 
@@ -94,7 +99,7 @@ class _Builder:
         self.unet = unet
         self.noisy = self.ops.parameter(list(chunk), np.float32, name="noisy")
         self.film = self.ops.parameter([chunk[0], 1, film], np.float32, name="film")
-        self.weights = [self.ops.constant(w) for w in weights]
+        self.weights = weights
         self.batch = chunk[0]
 
     def model(self) -> Any:
@@ -116,14 +121,14 @@ class _Builder:
             skips.append(x)
             if isinstance(shrink, nn.Conv1d):
                 every_other = ops.slice(self._taps(x), [0], [np.iinfo(np.int32).max], [2], [1])
-                x = self._affine(every_other, next(weights), next(weights))
+                x = self._affine(every_other, by_tap(next(weights)), next(weights))
         for block in u.middle:
             x = self._residual(x, block, weights, next(films))
         for first, second, _ in u.ups:
             x = ops.concat([x, skips.pop()], 2)
             x = self._residual(self._residual(x, first, weights, next(films)), second, weights, next(films))
             length = self._length(x)
-            x = self._affine(self._taps(x), next(weights), next(weights))
+            x = self._affine(self._taps(x), by_tap(next(weights)), next(weights))
             x = ops.reshape(x, [self.batch, 2 * length, -1], special_zero=False)
         x = self._convolved(x, u.out[0], weights)
         return self._affine(x, next(weights), next(weights))
@@ -138,10 +143,10 @@ class _Builder:
         padded = ops.pad(x, [0, 1, 0], [0, 1, 0], "constant", np.float32(0))
         return ops.concat([ops.slice(padded, [i], [i + length], [1], [1]) for i in range(3)], 2)
 
-    def _affine(self, x: Any, matrix: Any, bias: Any) -> Any:
-        return self.ops.add(self.ops.matmul(x, matrix, False, False), bias)
+    def _affine(self, x: Any, matrix: np.ndarray, bias: np.ndarray) -> Any:
+        return self.ops.add(self.ops.matmul(x, self.ops.constant(matrix), False, True), self.ops.constant(bias))
 
-    def _convolved(self, x: Any, block: Any, weights: Iterator[Any]) -> Any:
+    def _convolved(self, x: Any, block: Any, weights: Iterator[np.ndarray]) -> Any:
         """Conv → GroupNorm → Mish."""
         ops = self.ops
         matrix, bias, scale, offset = (next(weights) for _ in range(4))
@@ -149,8 +154,9 @@ class _Builder:
             flat = ops.reshape(x, [self.batch, -1], special_zero=False)
             x = ops.reshape(self._affine(flat, matrix, bias), [self.batch, 2, -1], special_zero=False)
         else:
-            x = self._affine(self._taps(x), matrix, bias)
-        return ops.mish(ops.add(ops.multiply(self._normalised(x, block[1]), scale), offset))
+            x = self._affine(self._taps(x), by_tap(matrix), bias)
+        scaled = ops.multiply(self._normalised(x, block[1]), ops.constant(scale))
+        return ops.mish(ops.add(scaled, ops.constant(offset)))
 
     def _normalised(self, x: Any, norm: nn.GroupNorm) -> Any:
         """Mean 0 and variance 1 in each group of channels. OpenVINO 2026.4's own GroupNormalization takes the process
@@ -160,7 +166,7 @@ class _Builder:
         normal = ops.mvn(grouped, [1, 3], True, norm.eps, "INSIDE_SQRT")
         return ops.reshape(normal, [self.batch, length, norm.num_channels], special_zero=False)
 
-    def _residual(self, x: Any, block: Any, weights: Iterator[Any], film: Any) -> Any:
+    def _residual(self, x: Any, block: Any, weights: Iterator[np.ndarray], film: Any) -> Any:
         ops = self.ops
         scale, shift = ops.split(film, 2, 2).outputs()
         h = ops.add(ops.multiply(self._convolved(x, block.first, weights), scale), shift)
