@@ -85,7 +85,7 @@ def settings(precision: str, threads: int) -> dict[str, Any]:
 
 
 def by_tap(matrix: Float[np.ndarray, "O C3"]) -> Float[np.ndarray, "O 3C"]:
-    """The columns tap by tap, as `_Builder._taps` lays the inputs side by side; FastUnet has them channel by channel."""
+    """Columns tap by tap, as `_Builder._taps` lays the inputs side by side; FastUnet has them channel by channel."""
     return np.ascontiguousarray(matrix.reshape(len(matrix), -1, 3).swapaxes(1, 2)).reshape(len(matrix), -1)
 
 
