@@ -84,7 +84,7 @@ def rig(tmp_path: Path, pad: Pad) -> Path:
 def rescue(session: Session, pad: Pad, task: TaskConfig, scale: ActionScale) -> None:
     """Watch the policy fail for a while, take over by the pad's button, do the task, let it go on until it ends."""
     standing, robot = session.standing, session.robot
-    while not (standing.state is State.RUNNING and session._recorded > 20):
+    while not (standing.state is State.RUNNING and session.driver.recorded > 20):
         time.sleep(0.01)
     while standing.state is State.RUNNING:
         pad.press(START)

@@ -55,7 +55,7 @@ class Bench:
     @property
     def recorded(self) -> int:
         """Ticks of the running attempt that were handed to the recorder."""
-        return self.session._recorded
+        return self.session.driver.recorded
 
     def stop(self) -> None:
         """STOP as the page sends it: straight to the hw server."""

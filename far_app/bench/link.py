@@ -99,7 +99,7 @@ class Run:
     def moving(self) -> None:
         """Until the arm is led by the policy, resumed if need be. Raises FarError where it does not come to that."""
         deadline = time.monotonic() + 2 * PATIENCE
-        while not (self.state is State.RUNNING and self.session._recorded > 15):
+        while not (self.state is State.RUNNING and self.session.driver.recorded > 15):
             if time.monotonic() > deadline:
                 raise FarError(f"the arm does not move: {self.state}, {self.session.board.reason}")
             if self.state in (State.FAULT, State.STOPPED):

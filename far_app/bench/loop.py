@@ -124,7 +124,7 @@ def naive_trials(
         session_.run()
     if session_.recorder.error is not None:
         raise session_.recorder.error
-    return statistics, session_.last_failure
+    return statistics, session_.driver.last_failure
 
 
 def processor_seconds(names: Sequence[str]) -> dict[str, float]:

@@ -1,7 +1,9 @@
-"""A session: many trials in real time under one operator. Drives far_app/trial.py at 30 Hz.
+"""A session: many trials in real time under one operator, at 30 Hz.
 
     every tick:   wait for the deadline → attend (newest observation, operator, latch, faults, freshness) → the trial
                   judges, plans and sends → record and show, until the next deadline
+
+far_app/trial.py says what a trial is, driver.py what each of its events asks for, supervision.py what else may happen.
 
 Called by `far run` and `far bench loop`. Whatever ends it, the arm is held and the recording closed.
 """
@@ -9,7 +11,6 @@ Called by `far run` and `far bench loop`. Whatever ends it, the arm is held and 
 from __future__ import annotations
 
 import logging
-import time
 from dataclasses import replace
 
 from far_app.alarm import Alarm
@@ -18,42 +19,31 @@ from far_app.detectors import OperatorOverride
 from far_app.errors import RobotError
 from far_app.guided import guided_trial
 from far_app.motion import ActionScale
-from far_app.protocols import EngineReport, Hold, Method, PlanRequest, Robot, RunsOnEngine, SuccessDetector
+from far_app.protocols import Hold, Method, Robot, SuccessDetector
 from far_app.scheduling import LOOP_PRIORITY, real_time_inside
 from far_app.session.board import Board
 from far_app.session.clock import TickClock
 from far_app.session.course import Assignment, Consecutive, Course, Demonstrations
+from far_app.session.driver import Driver
 from far_app.session.inbox import IntentInbox
 from far_app.session.lessons import Lessons
 from far_app.session.marking import Marking
 from far_app.session.operator import Operator
 from far_app.session.planners import ThreadedPlanner
 from far_app.session.publisher import TelemetryPublisher
-from far_app.session.realtime import collect_between, collector_off
+from far_app.session.realtime import collector_off
 from far_app.session.recorder import Recorder
 from far_app.session.review import Keep, Review, drop
 from far_app.session.settings import SessionSettings, TrialResult
-from far_app.session.standing import IN_ATTEMPT, Standing
+from far_app.session.standing import Standing
 from far_app.session.statistics import LoopStatistics
 from far_app.session.steering import Helper
 from far_app.session.supervision import Supervision, TrialAbandoned
-from far_app.session.timeline import AGGREGATE, INFER, OBSERVE, PUBLISH, RECORD
 from far_app.session.versions import VersionKeeper
 from far_app.session.watched import WatchedRobot
 from far_app.session_states import Happening, Intent, State
-from far_app.trial import (
-    NO_ALARM,
-    Adapted,
-    AfterHold,
-    AttemptEnded,
-    AttemptStarted,
-    Event,
-    Tick,
-    TrialEvents,
-    trial,
-)
-from far_app.types import Attempt, Step, Trial
-from far_app.what_if import CorrectFlag
+from far_app.trial import NO_ALARM, TrialEvents, trial
+from far_app.types import Trial
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +72,7 @@ class Session:
         self.settings, self.task, self.scale, self.alarm = settings, task, scale, alarm
         usual = Demonstrations if settings.demonstrate else Consecutive
         self.course: Course = course or usual(method, seed=settings.seed, trials=settings.trials)
-        self.planner, self.method, self.recorder, self.statistics = planner, method, recorder, statistics
+        self.planner, self.recorder, self.statistics = planner, recorder, statistics
         self.robot = WatchedRobot(robot, statistics)
         self.detector = OperatorOverride(detector)
         self.clock = TickClock(task.rate)
@@ -109,14 +99,12 @@ class Session:
         self.review = Review(self.standing, self.supervision, self.operator, keep)
         if settings.demonstrate:
             self.standing.withheld[Intent.HAND_BACK] = "a demonstration has no policy to hand back to"
+        self.driver = Driver(
+            settings=settings, planner=planner, inbox=inbox, statistics=statistics, clock=self.clock,
+            detector=self.detector, standing=self.standing, supervision=self.supervision, helper=self.helper,
+            operator=self.operator, versions=self.versions, lessons=self.lessons,
+        )  # fmt: skip
         self.results: list[TrialResult] = []
-        self.last_failure: Attempt | None = None
-        """The newest failed attempt."""
-        self._ended = float("nan")
-        self._attempts: list[Attempt] = []
-        self._chance = self._tick = self._recorded = 0
-        self._in_attempt = False
-        self._stretch = 1
 
     # ── trials ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -148,10 +136,10 @@ class Session:
 
     def _reviewed(self, kept: int) -> Intent:
         """The operator's word on the demonstration that has just ended; one that was cut off is discarded."""
-        if self.standing.state is State.FINISHED or not self._attempts:
+        if self.standing.state is State.FINISHED or not self.driver.attempts:
             return Intent.DISCARD
         try:
-            return self.review.ask(self._attempts[-1], kept, self.settings.trials)
+            return self.review.ask(self.driver.attempts[-1], kept, self.settings.trials)
         except TrialAbandoned:
             return Intent.DISCARD
 
@@ -167,8 +155,9 @@ class Session:
     def _run_trial(self, number: int, asked: Assignment) -> TrialResult:
         """One trial on one scene, whatever becomes of it."""
         self.standing.trial_begins()
-        self.method, self._attempts = asked.method, []
-        self._chance = asked.seed if asked.chance is None else asked.chance
+        chance = asked.seed if asked.chance is None else asked.chance
+        stretch = self.settings.first_stretch if number == 1 else 1
+        self.driver.trial_begins(asked.method, chance, stretch)
         task = replace(self.task, max_attempts=asked.max_attempts or self.task.max_attempts)
         self.lessons.trial_begins()
         self.versions.trial_begins()
@@ -177,12 +166,11 @@ class Session:
         if asked.gate is not None and self.settings.await_scene and self.robot.newest is not None:
             self.recorder.scene(asked.gate.accepted(self.robot.newest))
         self.standing.say(f"trial {number}: scene {asked.seed}")
-        self._stretch = self.settings.first_stretch if number == 1 else 1
-        events = self._events(asked.seed, task)
+        events = self._events(asked, task, chance, stretch)
         answer: float | None = None
         try:
             while True:
-                answer = self._answer(events.send(answer))
+                answer = self.driver.answer(events.send(answer))
         except (StopIteration, TrialAbandoned):
             pass
         except RobotError as error:
@@ -193,135 +181,28 @@ class Session:
             result = self._account(asked.seed, task.max_attempts)
         return result
 
-    def _events(self, seed: int, task: TaskConfig) -> TrialEvents:
+    def _events(self, asked: Assignment, task: TaskConfig, chance: int, stretch: int) -> TrialEvents:
         """What happens on this scene: Algorithm 1, or a person leading the arm by hand."""
         if self.settings.demonstrate == "hand":
-            return guided_trial(seed, self.robot, self.detector, task, self.scale, self.helper)
+            return guided_trial(asked.seed, self.robot, self.detector, task, self.scale, self.helper)
         return trial(
-            seed, self.robot, self.planner, self.method, self.detector, task, self.scale, self.lessons.start,
-            self._stretch, self.alarm, self.helper, self._chance,
+            asked.seed, self.robot, self.planner, asked.method, self.detector, task, self.scale, self.lessons.start,
+            stretch, self.alarm, self.helper, chance,
         )  # fmt: skip
 
-    def _answer(self, event: Event) -> float | None:
-        """What the trial's event asks of a driver in real time."""
-        match event:
-            case Tick():
-                return self._pass_tick(event)
-            case AttemptStarted():
-                self._attempt_started(event)
-            case AttemptEnded():
-                self._attempt_ended(event)
-            case Adapted():
-                self.lessons.adapted(event.adaptation, self.method)
-            case PlanRequest():
-                raise TypeError("a real-time planner plans by itself and never asks the driver")
-        return None
-
-    def _pass_tick(self, tick: Tick) -> float:
-        """Bookkeeping of the last tick, then wait for this one's deadline and attend to what happened."""
-        timeline = self.statistics.timeline
-        self.planner.go()
-        timeline.lap(AGGREGATE)
-        if tick.step is not None and tick.step.tick == self._recorded:
-            self._record(tick.step)
-        self._report()
-        timeline.lap(RECORD)
-        if tick.phase == "judging" and not self.board.reason:
-            self.board.reason = f"success or failure? Say so within {self.detector.patience:g} s, or it is a failure"
-            self.standing.say(self.board.reason)
-        self.standing.show()
-        timeline.lap(PUBLISH)
-        due = self.clock.wait()
-        timeline.begin(self._tick - tick.between if tick.phase == "attempt" else -1, due)
-        held = self.supervision.attend(tick.phase)
-        if held and tick.phase == "attempt" and self.standing.state in IN_ATTEMPT:
-            if self.settings.demonstrate != "hand":
-                self._prime()
-            self.clock.restart()
-            due = AfterHold(self.clock.wait())
-            timeline.restart()
-            self.supervision.attend(tick.phase)
-        elif held:
-            timeline.restart()
-        timeline.lap(OBSERVE)
-        self._tick += not tick.between
-        return due
-
-    def _attempt_started(self, event: AttemptStarted) -> None:
-        slowly = self._stretch > 1 and event.attempt_index == 1
-        pace = f" at 1/{self._stretch} speed, not counted" if slowly else ""
-        self.supervision.count_down(self.settings.countdown, f"attempt {event.attempt_index}{pace}")
-        self.standing.happen(Happening.AT_HOME)
-        self.standing.no_lesson = False
-        self.helper.attempt_begins()
-        version = self.versions.attempt_begins(event.policy_version)
-        self.board.attempt_started(event.attempt_index, version)
-        if isinstance(self.method.policy, RunsOnEngine):
-            self._runs_on(self.method.policy.runs_on)
-        self.recorder.begin_attempt(event.attempt_index, version)
-        if slowly:
-            self.standing.say(f"attempt {event.attempt_index} runs at 1/{self._stretch} of the policy's speed")
-            self.recorder.event("reduced_speed", pace.strip(), {"stretch": self._stretch})
-        self._recorded = self._tick = 0
-        self._in_attempt = True
-        if self.settings.demonstrate:
-            self.operator.ask(Intent.TAKE_OVER, "attempt")
-        if self.settings.demonstrate != "hand":
-            self._prime()
-        if event.attempt_index > 1:
-            self.statistics.homing.append(time.monotonic() - self._ended)
-        self.clock.restart()
-
-    def _runs_on(self, engine: EngineReport) -> None:
-        """Show and record what runs the policy; what was refused (and logged where it was) is told once."""
-        known = self.board.engine
-        for refused in engine.refused[len(known.refused) :]:
-            self.board.log(f"engine refused, {refused}; {engine.name} runs the policy", "warning")
-        if engine != known:
-            self.recorder.event("engine", engine.name, {"why": engine.why, "refused": list(engine.refused)})
-        self.board.engine = engine
-
-    def _attempt_ended(self, event: AttemptEnded) -> None:
-        attempt, standing = event.attempt, self.standing
-        for step in attempt.steps[self._recorded :]:
-            self._record(step)
-        self._report(all_times=True)
-        self.recorder.end_attempt(attempt)
-        self.board.history.attempt_ended(self.board.trial, attempt)
-        self.versions.attempt_ended(attempt.outcome.success)
-        self._in_attempt = False
-        self._attempts.append(attempt)
-        self.last_failure = self.last_failure if attempt.outcome.success else attempt
-        self._ended = time.monotonic()
-        word = "success" if attempt.outcome.success else "failure"
-        standing.say(f"attempt {attempt.index}: {word} by {attempt.outcome.judged_by}, {len(attempt.steps)} ticks")
-        self.supervision.rest()
-        if standing.state is State.FINISHED:
-            raise TrialAbandoned
-        if attempt.outcome.success:
-            standing.happen(Happening.SUCCEEDED)
-        else:
-            standing.happen(Happening.FAILED_LAST if event.last or standing.skipping else Happening.FAILED_RETRY)
-        if standing.skipping:
-            raise TrialAbandoned
-        collect_between()
-
     def _account(self, seed: int, max_attempts: int) -> TrialResult:
-        """The trial's row and result; an attempt that was cut off has no outcome and is closed as such."""
-        standing = self.standing
-        if self._in_attempt:
-            self._report(all_times=True)
-            self._in_attempt = False
-            self.recorder.abandon_attempt(self.board.reason or "the session was ended")
-        if standing.marked is not None and self._attempts:
-            self._attempts[-1] = replace(self._attempts[-1], outcome=standing.marked)
+        """The trial's row and result."""
+        standing, attempts = self.standing, self.driver.attempts
+        self.driver.cut_off(self.board.reason or "the session was ended")
+        if standing.marked is not None and attempts:
+            attempts[-1] = replace(attempts[-1], outcome=standing.marked)
             self.recorder.mark(standing.marked)
-        result = Trial(scene_seed=seed, attempts=tuple(self._attempts), adaptations=tuple(self.lessons.learnt))
-        last = self._attempts[-1].outcome if self._attempts else None
+        result = Trial(scene_seed=seed, attempts=tuple(attempts), adaptations=tuple(self.lessons.learnt))
+        last = attempts[-1].outcome if attempts else None
         judged_by = last.judged_by.value if last else ""
-        helped = any(step.intervention for attempt in self._attempts for step in attempt.steps)
-        counted = self._stretch == 1 and not helped
-        remarks = ["began at reduced speed"] * (self._stretch > 1) + ["a person helped"] * helped
+        helped = any(step.intervention for attempt in attempts for step in attempt.steps)
+        counted = self.driver.stretch == 1 and not helped
+        remarks = ["began at reduced speed"] * (self.driver.stretch > 1) + ["a person helped"] * helped
         note = "; ".join([*remarks, last.note if last else "no attempt was finished"])
         self.board.trial_ended(result, judged_by, note, counted)
         self.recorder.end_trial(result.success, len(result.attempts))
@@ -343,34 +224,3 @@ class Session:
         self.standing.show()
         self.recorder.close()
         self.planner.close()
-
-    # ── plans, steps, adaptation ────────────────────────────────────────────────────────────────────────────────────
-
-    def _prime(self) -> None:
-        """The arm is still: wait for the chunk of the coming tick, so that motion starts without a starved tick."""
-        policy, newest = self.method.policy, self.robot.refresh()
-        self.planner.prime(
-            PlanRequest(
-                history=(newest,) * policy.spec.n_obs, tick=self._tick, policy=policy,
-                noise_key=(self._chance, self.board.attempt, self._tick),
-            )
-        )  # fmt: skip
-
-    def _record(self, step: Step) -> None:
-        self._recorded = step.tick + 1
-        self.statistics.stepped(step)
-        self.board.stepped(step)
-        self.recorder.add_step(step)
-
-    def _report(self, *, all_times: bool = False) -> None:
-        """New chunks, the operator's words on them and what is being learnt go to the page and the recording; so do the
-        attempt's ticks whose times are complete, or all that are left."""
-        self.statistics.timeline.elsewhere(INFER, self.planner.spent())
-        for times in self.statistics.timeline.settled(all_of_them=all_times):
-            self.recorder.add_tick_times(times)
-        for chunk in self.planner.handed_out():
-            self.board.planned(chunk)
-            self.recorder.add_chunk(chunk)
-        for asked in self.inbox.take(CorrectFlag):
-            self.lessons.correct(asked)
-        self.lessons.report()

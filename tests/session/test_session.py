@@ -76,7 +76,7 @@ def test_a_trial_succeeds_with_no_button_and_the_arm_is_held_at_the_end():
     assert isinstance(desk.robot.requests[-1], Hold)
     assert desk.statistics.ticks >= len(desk.robot.targets) > 10
     assert len(desk.statistics.late) >= desk.statistics.ticks - 1
-    assert not desk.session._attempts[0].steps[0].starved, "the first chunk is there before the first tick"
+    assert not desk.session.driver.attempts[0].steps[0].starved, "the first chunk is there before the first tick"
 
 
 def test_a_failure_is_adapted_from_in_the_background_and_the_retry_runs_the_new_version():
@@ -84,7 +84,7 @@ def test_a_failure_is_adapted_from_in_the_background_and_the_retry_runs_the_new_
     (result,) = desk.session.run()
     assert result.success and result.attempts == 3
     assert desk.method.adapted_attempts == [1, 2]
-    versions = [a.policy_version for a in desk.session._attempts]
+    versions = [a.policy_version for a in desk.session.driver.attempts]
     assert versions == ["forward-0", "forward-0+1", "forward-0+1+2"]
     assert desk.method.policy.version == "forward-0", "the base policy returns at the trial's end"
 
@@ -92,7 +92,7 @@ def test_a_failure_is_adapted_from_in_the_background_and_the_retry_runs_the_new_
 def test_a_slow_policy_never_blocks_a_tick():
     desk = Desk(policy=Forward(speed=0.1, seconds=0.07), horizon=40, attempts=1)
     desk.session.run()
-    steps = desk.session._attempts[0].steps
+    steps = desk.session.driver.attempts[0].steps
     assert len(steps) == 40
     assert sum(s.tick - s.chunk_tick >= 3 for s in steps) > 20, "the newest valid plan continues"
     deadlines = np.diff([s.deadline for s in steps])
@@ -105,7 +105,7 @@ def test_an_adaptation_over_its_limit_is_cancelled_and_the_previous_version_retr
     desk.session.run()
     assert time.monotonic() - began < 10
     assert [a.status for a in desk.session.lessons.learnt] == ["timeout"]
-    assert [a.policy_version for a in desk.session._attempts] == ["forward-0", "forward-0"]
+    assert [a.policy_version for a in desk.session.driver.attempts] == ["forward-0", "forward-0"]
 
 
 def test_pause_holds_the_arm_and_resume_starts_from_the_measured_pose():
@@ -149,7 +149,7 @@ def test_stop_ends_the_attempt_and_only_resume_goes_on():
     desk.when(lambda: desk.state is State.STOPPED, resume)
     (result,) = desk.session.run()
     assert result.success and result.attempts == 2
-    stopped = desk.session._attempts[0].outcome
+    stopped = desk.session.driver.attempts[0].outcome
     assert not stopped.success and stopped.judged_by is Judge.OPERATOR and "STOP" in stopped.note
     assert desk.method.adapted_attempts == [], "a stop teaches nothing"
     kinds = [type(r) for r in desk.robot.requests]
@@ -230,7 +230,7 @@ def test_trouble_is_a_fault_that_ends_a_headless_session_with_an_error(trouble):
     }
     with pytest.raises(SessionFault, match=message[trouble]):
         desk.session.run()
-    (attempt,) = desk.session._attempts
+    (attempt,) = desk.session.driver.attempts
     assert attempt.outcome.judged_by is Judge.FAULT and len(attempt.steps) > 3
     (result,) = desk.session.results
     assert not result.success and result.judged_by == "fault"
@@ -280,7 +280,7 @@ def test_a_person_judges_after_the_horizon_with_the_arm_held():
     (result,) = desk.session.run()
     assert (result.success, result.judged_by) == (True, "operator")
     assert any(isinstance(r, Hold) and "waiting for the operator" in r.reason for r in desk.robot.requests)
-    assert len(desk.session._attempts[0].steps) == 10, "judging uses none of the horizon's ticks"
+    assert len(desk.session.driver.attempts[0].steps) == 10, "judging uses none of the horizon's ticks"
 
 
 def test_a_person_who_says_nothing_within_the_time_means_failure():

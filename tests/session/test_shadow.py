@@ -34,7 +34,7 @@ def test_a_shadow_session_runs_to_the_horizon_and_sends_nothing():
     assert (result.success, result.judged_by) == (False, "horizon")
     assert inner.targets == [] and {type(r) for r in inner.requests} <= {Hold}
     assert np.array_equal(inner.pose.position, HOME.position)
-    (attempt,) = desk.session._attempts
+    (attempt,) = desk.session.driver.attempts
     assert len(attempt.steps) == 15 and all(np.isnan(s.sent).all() for s in attempt.steps)
     assert all(s.commanded[0] == 0.5 for s in attempt.steps), "planned all the same"
     assert desk.statistics.overruns == 0

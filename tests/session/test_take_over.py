@@ -99,7 +99,7 @@ def test_a_person_takes_over_moves_the_arm_and_hands_back_without_a_jump():
         desk.reaches(State.RUNNING)
 
     (result,) = desk.run(act)
-    steps = desk.session._attempts[0].steps
+    steps = desk.session.driver.attempts[0].steps
     theirs = np.array([s.intervention for s in steps])
     first, last = np.flatnonzero(theirs)[[0, -1]]
     assert theirs[first : last + 1].all(), "one stretch of ticks is labelled"
@@ -130,7 +130,7 @@ def test_the_policy_does_not_see_chunks_from_before_the_person_moved_the_arm():
         desk.inbox.put(Intent.HAND_BACK)
 
     desk.run(act)
-    steps = desk.session._attempts[0].steps
+    steps = desk.session.driver.attempts[0].steps
     last = max(s.tick for s in steps if s.intervention)
     own = [s for s in steps if last < s.tick <= last + 3 and not s.starved]
     assert own and all(s.chunk_tick >= last - 3 for s in own)
@@ -155,7 +155,7 @@ def test_success_while_a_person_has_the_arm_is_a_recorded_demonstration(tmp_path
     told = {e.event: e for e in session.log}
     assert told["taken_over"].detail["source"] == "page"
     (recorded,) = session.attempts()
-    assert [s.intervention for s in recorded.steps] == [s.intervention for s in desk.session._attempts[0].steps]
+    assert [s.intervention for s in recorded.steps] == [s.intervention for s in desk.session.driver.attempts[0].steps]
     assert any(s.intervention for s in read_attempt(session.files[0]).steps)
 
 
@@ -207,7 +207,7 @@ def test_what_does_not_apply_is_refused_with_a_reason():
         desk.reaches(State.RUNNING)
 
     desk.run(act)
-    assert all(abs(s.commanded[2]) == 0.0 for s in desk.session._attempts[0].steps), "the refused press moved nothing"
+    assert all(abs(s.commanded[2]) == 0.0 for s in desk.session.driver.attempts[0].steps), "the refused press moved nothing"
 
 
 @pytest.mark.parametrize("phase", ["homing", "between"])
@@ -256,7 +256,7 @@ def test_a_person_who_is_asked_for_a_word_may_take_the_arm_instead():
 
     (result,) = desk.run(act)
     assert (result.success, result.judged_by) == (True, "operator")
-    steps = desk.session._attempts[0].steps
+    steps = desk.session.driver.attempts[0].steps
     assert [s.intervention for s in steps[:10]] == [False] * 10 and all(s.intervention for s in steps[10:])
 
 
@@ -295,5 +295,5 @@ def test_a_devices_button_takes_over_its_motion_moves_the_arm_and_its_silence_ho
     desk.when(desk.moving, act)
     desk.session.run()
     assert seated["still"]
-    theirs = [s for s in desk.session._attempts[0].steps if s.intervention]
+    theirs = [s for s in desk.session.driver.attempts[0].steps if s.intervention]
     assert max(s.sent[2] for s in theirs) == pytest.approx(0.25), "up to what the device asked for"

@@ -54,13 +54,13 @@ class Keeping(Faster):
 def desk(attempts=3, trials=1, adapting_seconds=0.0, **settings) -> Desk:
     method = Keeping(Forward(speed=0.02), adapting_seconds)
     made = Desk(horizon=8, attempts=attempts, trials=trials, headless=False, method=method, **settings)
-    made.acted, before = [], made.session._attempt_ended
+    made.acted, before = [], made.session.driver._attempt_ended
 
     def ended(event):
         made.acted.append((made.session.board.trial, event.attempt.index, event.attempt.policy_version))
         before(event)
 
-    made.session._attempt_ended = ended
+    made.session.driver._attempt_ended = ended
     return made
 
 

@@ -91,5 +91,5 @@ def test_a_session_ends_its_attempt_at_the_detectors_word(watching):
     desk = Desk(policy=Forward(speed=0.05), horizon=60, attempts=1, detector=watching(Slow()))
     (result,) = desk.session.run()
     assert (result.success, result.judged_by) == (True, "detector")
-    assert len(desk.session._attempts[0].steps) < 30
+    assert len(desk.session.driver.attempts[0].steps) < 30
     assert threading.active_count() < 50
