@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from playwright.sync_api import Error, sync_playwright
 
-from far_app.recording.reader import read_attempt
+from far_app.recording.attempt_reader import read_attempt
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "docs/screens"

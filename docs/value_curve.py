@@ -11,7 +11,7 @@ import numpy as np
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from far_app.recording.reader import read_attempt
+from far_app.recording.attempt_reader import read_attempt
 
 INK, CURVE, FLAG = "#22303c", "#1f77b4", "#d62728"
 

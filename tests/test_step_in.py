@@ -25,7 +25,8 @@ from far_app.exchange.robomimic_read import read_robomimic
 from far_app.experts import expert
 from far_app.learning.dataset import read_episodes
 from far_app.motion import ActionScale
-from far_app.recording.reader import read_attempt, read_session
+from far_app.recording.attempt_reader import read_attempt
+from far_app.recording.reader import read_session
 from far_app.session.inbox import IntentInbox
 from far_app.session.session import Session
 from far_app.session.statistics import LoopStatistics

@@ -26,7 +26,7 @@ import zmq
 
 from far_app.endpoints import Endpoints
 from far_app.errors import FarError
-from far_app.recording.reader import read_attempt
+from far_app.recording.attempt_reader import read_attempt
 from far_app.recording.replay import LOOPBACK
 from far_app.recording.scan import ends_in_order
 from far_app.telemetry import Telemetry

@@ -23,7 +23,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from jaxtyping import Bool, Float, UInt8
 
-from far_app.recording.reader import AttemptRecording
+from far_app.recording.attempt_reader import AttemptRecording
 from far_app.types import Step
 from ui.plot_model import flagged_ticks
 

@@ -7,10 +7,11 @@ from pathlib import Path
 from far_app.errors import RecordingError
 from far_app.marks import Judged, Mark
 from far_app.recording.append_file import being_written
+from far_app.recording.attempt_reader import read_attempt
 from far_app.recording.corrections import CORRECTIONS_FILE, Corrections, corrections
 from far_app.recording.judged import judged
 from far_app.recording.marks import MARKS_FILE
-from far_app.recording.reader import SessionRecording, read_attempt, read_session
+from far_app.recording.reader import SessionRecording, read_session
 from far_app.recording.schema import TRIALS_FILE
 from far_app.types import FlagCorrection
 from ui.why_model import Case, Setting, case_of

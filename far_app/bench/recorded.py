@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from far_app.recording.reader import AttemptRecording, read_session
+from far_app.recording.attempt_reader import AttemptRecording
+from far_app.recording.reader import read_session
 
 
 def attempts_in(recordings: Path) -> list[AttemptRecording]:

@@ -22,8 +22,9 @@ from far_app.endpoints import Endpoints
 from far_app.errors import ConfigError, FarError
 from far_app.marks import MarkAttempt
 from far_app.recording import corrections
+from far_app.recording.attempt_reader import read_attempt
 from far_app.recording.judged import mark_closed
-from far_app.recording.reader import SessionRecording, read_attempt, read_session
+from far_app.recording.reader import SessionRecording, read_session
 from far_app.what_if import RECORDED, Answer, Answerer, CorrectFlag, Question
 from far_app.wire import WireError, pack, unpack
 

@@ -8,8 +8,9 @@ from typing import Literal
 import numpy as np
 
 from far_app.learning.dataset import Episode
+from far_app.recording.attempt_reader import AttemptRecording
 from far_app.recording.episodes import judged_episode
-from far_app.recording.reader import AttemptRecording, SessionRecording
+from far_app.recording.reader import SessionRecording
 from far_app.types import Outcome, Step
 
 Segment = Literal["attempt", "recovery"]

@@ -9,7 +9,7 @@ from pathlib import Path
 from far_app.errors import ConfigError
 from far_app.exchange.select import Chosen
 from far_app.exchange.target import whole
-from far_app.recording.reader import AttemptRecording
+from far_app.recording.attempt_reader import AttemptRecording
 from far_app.recording.replay import WriteRrd
 
 

@@ -9,7 +9,8 @@ from typing import Literal
 
 from far_app.errors import RecordingError
 from far_app.exchange.rollout import Rollout, Segment, human, rollout
-from far_app.recording.reader import AttemptRecording, SessionRecording, read_attempt, read_session
+from far_app.recording.attempt_reader import AttemptRecording, read_attempt
+from far_app.recording.reader import SessionRecording, read_session
 from far_app.types import Outcome
 
 Only = Literal["all", "successes", "recoveries", "human"]

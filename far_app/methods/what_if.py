@@ -22,7 +22,7 @@ from far_app.learning.preference import Demonstrations
 from far_app.methods import evidence
 from far_app.methods.retry import Ingredients, RetryMethod
 from far_app.protocols import PolicySpec
-from far_app.recording.reader import AttemptRecording
+from far_app.recording.attempt_reader import AttemptRecording
 from far_app.seeding import generator
 from far_app.types import Adaptation, AdaptationStep, Attempt, FlagCorrection, Judge, Outcome
 from far_app.what_if import RECORDED, Answer, Moved, Question

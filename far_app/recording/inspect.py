@@ -10,8 +10,9 @@ from datetime import datetime
 from pathlib import Path
 
 from far_app.errors import RecordingError
+from far_app.recording.attempt_reader import AttemptRecording, read_attempt
 from far_app.recording.codec import Json, plain
-from far_app.recording.reader import AttemptRecording, SessionRecording, read_attempt, read_session
+from far_app.recording.reader import SessionRecording, read_session
 from far_app.recording.schema import SESSION_FILE, TRIALS_FILE, LogEntry
 from far_app.recording.session_folder import attempt_name
 from far_app.types import Outcome

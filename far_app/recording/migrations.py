@@ -1,7 +1,7 @@
 """Recordings of older schemas, read as if they were written today; the files themselves are never rewritten.
 
-MIGRATIONS[n] lifts what schema n wrote to schema n + 1: JSON body by JSON body, by where it stood. Called by reader.py
-before anything is decoded. To raise SCHEMA_VERSION: say in VERSIONS what is new, and add the lift from the version
+MIGRATIONS[n] lifts what schema n wrote to schema n + 1: JSON body by JSON body, by where it stood. The readers call
+it before anything is decoded. To raise SCHEMA_VERSION: say in VERSIONS what is new, and add the lift from the version
 before; tests/recording/test_migrations.py fails while one is missing.
 """
 

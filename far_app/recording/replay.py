@@ -20,8 +20,9 @@ from pathlib import Path
 from urllib.parse import quote
 
 from far_app.errors import ConfigError, RecordingError
+from far_app.recording.attempt_reader import AttemptRecording, read_attempt
 from far_app.recording.inspect import find_session
-from far_app.recording.reader import AttemptRecording, read_attempt, read_session
+from far_app.recording.reader import read_session
 from far_app.recording.scan import ends_in_order
 
 log = logging.getLogger(__name__)

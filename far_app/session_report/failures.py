@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 
 from far_app.config import AttributionConfig
 from far_app.learning.attribution import flag, value_change
-from far_app.recording.reader import AttemptRecording
+from far_app.recording.attempt_reader import AttemptRecording
 from far_app.types import Observation, Outcome
 
 HORIZON = 8

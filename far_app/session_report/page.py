@@ -13,7 +13,8 @@ import numpy as np
 
 from far_app.config import AttributionConfig, from_table
 from far_app.errors import ConfigError, RecordingError
-from far_app.recording.reader import SessionRecording, read_attempt, read_session
+from far_app.recording.attempt_reader import read_attempt
+from far_app.recording.reader import SessionRecording, read_session
 from far_app.session_report.failures import card
 from far_app.session_report.outcomes import Group, by_attempt, differences, groups, labels
 from far_app.session_report.plans import Planned, plans

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 
 from far_app.errors import ConfigError, RecordingError
+from far_app.recording.attempt_reader import read_attempt
 from far_app.recording.images import decode_png, encode_png
-from far_app.recording.reader import SessionRecording, read_attempt
+from far_app.recording.reader import SessionRecording
 from far_app.recording.scene_file import SceneAccepted
 from far_app.recording.session_folder import attempt_name
 from far_app.trial_plan.plan import Scene, TrialPlan

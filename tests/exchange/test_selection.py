@@ -13,7 +13,7 @@ from far_app.cli import main
 from far_app.errors import ConfigError
 from far_app.exchange.rrd import from_tick, write_rrds
 from far_app.exchange.select import Selection, chosen, rollouts, start_of, wanted
-from far_app.recording.reader import read_attempt
+from far_app.recording.attempt_reader import read_attempt
 from far_app.types import Judge, Outcome
 from tests.recording import sessions, values
 

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from far_app.recording.attempt_reader import read_attempt
 from far_app.recording.inspect import inspect_session
-from far_app.recording.reader import read_attempt, read_session
+from far_app.recording.reader import read_session
 
 from . import sessions, values
 

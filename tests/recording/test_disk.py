@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from far_app.errors import RecordingError
+from far_app.recording.attempt_reader import read_attempt
 from far_app.recording.inspect import inspect_session
-from far_app.recording.reader import read_attempt
 from far_app.recording.session_folder import check_space
 from far_app.recording.writer import SessionWriter
 

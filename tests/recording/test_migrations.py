@@ -14,9 +14,10 @@ from mcap.writer import Writer
 
 from far_app.errors import RecordingError
 from far_app.recording import migrations
+from far_app.recording.attempt_reader import read_attempt
 from far_app.recording.inspect import inspect_session
 from far_app.recording.migrations import MIGRATIONS, VERSIONS, migrated, readable
-from far_app.recording.reader import read_attempt, read_session
+from far_app.recording.reader import read_session
 from far_app.recording.schema import SCHEMA_VERSION
 
 from . import sessions

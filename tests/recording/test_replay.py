@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from far_app.errors import ConfigError, RecordingError
-from far_app.recording.reader import AttemptRecording
+from far_app.recording.attempt_reader import AttemptRecording
 from far_app.recording.replay import lacking_rrd, make_rrd, make_rrds, open_viewer, replay, rrd_path, viewer_command
 
 from . import sessions

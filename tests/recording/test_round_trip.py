@@ -12,8 +12,9 @@ from mcap.reader import make_reader
 from PIL import Image
 
 from far_app.errors import RecordingError
+from far_app.recording.attempt_reader import read_attempt
 from far_app.recording.images import decode_png, encode_png, stored_png
-from far_app.recording.reader import read_attempt, read_session
+from far_app.recording.reader import read_session
 from far_app.types import AdaptationStep, Judge, Outcome
 
 from . import sessions, values

@@ -13,7 +13,8 @@ from far_app.detectors import PersonJudge
 from far_app.device_input import DeviceInput
 from far_app.motion import ActionScale
 from far_app.protocols import Hold
-from far_app.recording.reader import read_attempt, read_session
+from far_app.recording.attempt_reader import read_attempt
+from far_app.recording.reader import read_session
 from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
 from far_app.session_states import Intent, State
@@ -207,7 +208,8 @@ def test_what_does_not_apply_is_refused_with_a_reason():
         desk.reaches(State.RUNNING)
 
     desk.run(act)
-    assert all(abs(s.commanded[2]) == 0.0 for s in desk.session.driver.attempts[0].steps), "the refused press moved nothing"
+    steps = desk.session.driver.attempts[0].steps
+    assert all(abs(s.commanded[2]) == 0.0 for s in steps), "the refused press moved nothing"
 
 
 @pytest.mark.parametrize("phase", ["homing", "between"])

@@ -12,7 +12,8 @@ import pytest
 
 from far_app.cli import main
 from far_app.config import AttributionConfig
-from far_app.recording.reader import read_attempt, read_session
+from far_app.recording.attempt_reader import read_attempt
+from far_app.recording.reader import read_session
 from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
 from far_app.session_report.failures import blame

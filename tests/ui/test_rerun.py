@@ -21,7 +21,7 @@ import rerun as rr
 from rerun.chunk import RrdReader
 from ui_stage import HORIZON, H, Stage, adapting, running
 
-from far_app.recording.reader import AttemptRecording
+from far_app.recording.attempt_reader import AttemptRecording
 from far_app.recording.schema import AttemptHeader, RecordedEvent
 from far_app.telemetry import LogLine
 from far_app.types import ACTION_DIM, Adaptation, Judge, Observation, Outcome, Pose, RobotMode, RobotStatus, Step

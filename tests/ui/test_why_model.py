@@ -12,7 +12,8 @@ import pytest
 from far_app.errors import RecordingError
 from far_app.marks import Judged, Mark, Verdict
 from far_app.recording import corrections, marks
-from far_app.recording.reader import read_attempt, read_session
+from far_app.recording.attempt_reader import read_attempt
+from far_app.recording.reader import read_session
 from far_app.types import Contrast, FlagCorrection
 from far_app.what_if import RECORDED, Answer
 from ui import why_html, why_marks
