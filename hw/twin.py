@@ -116,14 +116,21 @@ class TwinPlant:
         dofs = np.array([self.model.joint(f"robot0_joint{i}").dofadr[0] for i in range(1, 8)])
         mujoco.mj_forward(self.model, self.data)
         self.osc = OperationalSpace(self.model, self.data, self._site, dofs, self._arm_qpos, STIFFNESS)
-        self._fingers = [(self.model.actuator(name).id, opens) for name, opens in self.arm.fingers]
+        self._fingers = [self._finger(self.model.actuator(name).id, opens_low) for name, opens_low in self.arm.fingers]
         base = self.model.body("robot0_base").id
         if self.rig.base:
             self.model.body_pos[base] = self.rig.base
             mujoco.mj_forward(self.model, self.data)
         self._base_position = self.data.xpos[base].copy()
         self._base_quaternion = quat_wxyz_to_xyzw(self.data.xquat[base])
+        self._base_inverse = quat_inverse(self._base_quaternion)
+        self._base_rotation = self.data.xmat[base].reshape(3, 3).copy()
         self._objects = {name: self._place_of(element) for name, element in self.task.objects}
+
+    def _finger(self, actuator: int, opens_low: bool) -> tuple[int, float, float]:
+        """(actuator, its control where the hand is open, where it is closed)."""
+        low, high = self.model.actuator_ctrlrange[actuator].tolist()
+        return (actuator, low, high) if opens_low else (actuator, high, low)
 
     def _place_of(self, element: str) -> tuple[np.ndarray, np.ndarray]:
         """World position and rotation matrix of a body or site, as views that follow the simulation."""
@@ -135,15 +142,13 @@ class TwinPlant:
 
     def to_base(self, position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -> Pose:
         """A world pose (xyzw) in the arm's base frame."""
-        inverse, offset = quat_inverse(self._base_quaternion), np.append(position - self._base_position, 0.0)
-        rotated = quat_multiply(quat_multiply(inverse, offset), self._base_quaternion)
-        return Pose(position=rotated[:3], quaternion=quat_multiply(inverse, quaternion))
+        offset = position - self._base_position
+        return Pose(position=offset @ self._base_rotation, quaternion=quat_multiply(self._base_inverse, quaternion))
 
     def to_world(self, pose: Pose) -> Pose:
         """A base-frame pose in the world."""
-        q = self._base_quaternion
-        rotated = quat_multiply(quat_multiply(q, np.append(pose.position, 0.0)), quat_inverse(q))
-        return Pose(position=rotated[:3] + self._base_position, quaternion=quat_multiply(q, pose.quaternion))
+        position = self._base_rotation @ pose.position + self._base_position
+        return Pose(position=position, quaternion=quat_multiply(self._base_quaternion, pose.quaternion))
 
     def reset(self, seed: int) -> None:
         seed_placements(self.env.placement_initializer, np.random.default_rng(seed))
@@ -184,25 +189,25 @@ class TwinPlant:
         """Base frame."""
         quaternion = np.empty(4)
         mujoco.mju_mat2Quat(quaternion, matrix)
-        return self.to_base(position.copy(), quat_wxyz_to_xyzw(quaternion))
+        return self.to_base(position, quat_wxyz_to_xyzw(quaternion))
 
     def servo(self, pose: Pose, gripper: float) -> None:
         self.osc.aim(self.to_world(pose))
-        self._grip_target = float(np.clip(gripper, -1.0, 1.0))
+        self._grip_target = max(-1.0, min(1.0, gripper))
 
     def advance(self) -> None:
         reach = 2.0 / (GRIPPER_SECONDS * SERVO_HZ)
-        self._grip += float(np.clip(self._grip_target - self._grip, -reach, reach))
+        self._grip += max(-reach, min(reach, self._grip_target - self._grip))
         closed = (self._grip + 1.0) / 2.0
-        for finger, opens_low in self._fingers:
-            low, high = self.model.actuator_ctrlrange[finger]
-            self.data.ctrl[finger] = low + (closed if opens_low else 1.0 - closed) * (high - low)
+        model, data, control = self.model, self.data, self.data.ctrl
+        for finger, opened, shut in self._fingers:
+            control[finger] = opened + closed * (shut - opened)
         for i in range(SUBSTEPS):
-            mujoco.mj_step1(self.model, self.data)
+            mujoco.mj_step1(model, data)
             if i == 0:
                 self.osc.refresh()
-            self.data.ctrl[self._arm_actuators] = self.osc.torques()
-            mujoco.mj_step2(self.model, self.data)
+            control[self._arm_actuators] = self.osc.torques()
+            mujoco.mj_step2(model, data)
         self._ticks += 1
         if self._ticks % self._policy_tick == 0:
             self._task_check = (bool(self.env._check_success()), float(self.env.reward(None)))
