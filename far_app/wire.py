@@ -58,9 +58,37 @@ for _cls in (
 
 def pack(message: Any) -> bytes:
     """One registered value as bytes."""
-    packed = msgpack.packb([WIRE_VERSION, _lower(message)], use_bin_type=True)
+    return _packed(_lower(message))
+
+
+def _packed(lowered: Any) -> bytes:
+    packed = msgpack.packb([WIRE_VERSION, lowered], use_bin_type=True)
     assert packed is not None, "packb always answers"
     return packed
+
+
+class Packer:
+    """`pack` for a stream of messages most of whose fields stay the same objects: those are lowered once. They must not
+    be changed in place."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, tuple[Any, Any]] = {}
+
+    def pack(self, message: Any) -> bytes:
+        """One registered value as bytes, the same as `pack` makes."""
+        kind, known = type(message), self._known
+        if kind not in _FIELDS:
+            return pack(message)
+        inside = {}
+        for name in _FIELDS[kind]:
+            value = getattr(message, name)
+            if type(value) in _AS_THEY_ARE:
+                inside[name] = value
+                continue
+            if (before := known.get(name)) is None or before[0] is not value:
+                before = known[name] = value, _lower(value)
+            inside[name] = before[1]
+        return _packed({"!": kind.__name__, "f": inside})
 
 
 def unpack(raw: bytes) -> Any:

@@ -10,7 +10,7 @@ from far_app.session_states import Intent, State
 from far_app.take_over import Source, Steering
 from far_app.telemetry import LogLine, LoopHealth, OperatorIntent, Telemetry, TrialRow
 from far_app.types import TICK_STAGES, AdaptationStep, RobotMode, RobotStatus
-from far_app.wire import WireError, pack, unpack
+from far_app.wire import Packer, WireError, pack, unpack
 from tests.recording import values
 
 
@@ -32,6 +32,18 @@ def snapshot() -> Telemetry:
 ], ids=lambda m: type(m).__name__)  # fmt: skip
 def test_what_is_packed_comes_back(message):
     assert values.same(unpack(pack(message)), message)
+
+
+def test_a_packer_packs_a_stream_as_pack_does():
+    """Whatever changes from one message to the next, and whatever stays the same object."""
+    packer, first = Packer(), snapshot()
+    line = LogLine(stamp=1.0, level="error", text="b")
+    stream = [
+        first, first, replace(first, seq=4), replace(first, log=(*first.log, line)), replace(first, history=()), first,
+        replace(first, robot=None, eef=values.pose(0.4)), values.chunk(2, candidates=4), first,
+    ]  # fmt: skip
+    for message in stream:
+        assert packer.pack(message) == pack(message)
 
 
 def test_numpys_numbers_travel_as_numbers():

@@ -31,6 +31,8 @@ class Board:
         self._chunk_horizon = chunk_horizon
         self.history = History()
         self._log = deque[LogLine](maxlen=50)
+        self._log_told: tuple[LogLine, ...] = ()
+        """The same, made anew after a change only."""
         self._values: list[float] = []
         self._helped = 0
         """Ticks of the attempt in which a person had the arm: the horizon stands still meanwhile."""
@@ -68,6 +70,7 @@ class Board:
 
     def log(self, text: str, level: str = "info") -> None:
         self._log.append(LogLine(stamp=time.monotonic(), level=level, text=text))
+        self._log_told = tuple(self._log)
 
     def trial_awaited(self, method: str, *, blind: bool) -> None:
         """What is told of the trial that comes."""
@@ -142,7 +145,7 @@ class Board:
             eef=newest.eef if newest else None, gripper=newest.gripper if newest else 0.0,
             action=step.commanded if step is not None else np.zeros(0), chunk_path=self._path(newest),
             history=self.history.trials,
-            attempts=self.history.attempts, log=tuple(self._log), refusal=self.refusal, allowed=allowed,
+            attempts=self.history.attempts, log=self._log_told, refusal=self.refusal, allowed=allowed,
             steering=self.steering, versions=self.versions, plan=self.plan, scene=self.scene,
         )  # fmt: skip
         return blinded(whole) if self.blind else whole

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import zmq
 
 from far_app.telemetry import LoopHealth, Telemetry
-from far_app.wire import pack
+from far_app.wire import Packer
 
 RATE = 15.0
 """Snapshots a second."""
@@ -42,7 +42,7 @@ class TelemetryPublisher:
         self._socket.close(linger=200)
 
     def _publish(self) -> None:
-        closing = False
+        closing, packer = False, Packer()
         loop, next_health = LoopHealth(), 0.0
         while not closing:
             closing = self._closing.wait(1.0 / RATE)
@@ -52,4 +52,4 @@ class TelemetryPublisher:
             if newest is None:
                 continue
             snapshot = dataclasses.replace(newest, seq=next(self._seq), stamp=time.monotonic(), loop=loop)
-            self._socket.send(pack(snapshot), zmq.NOBLOCK)
+            self._socket.send(packer.pack(snapshot), zmq.NOBLOCK)
