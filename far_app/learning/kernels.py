@@ -15,7 +15,10 @@ import numpy as np
 from numba import njit
 
 f32 = np.float32
-FAST = {"nogil": True, "error_model": "numpy", "fastmath": True, "cache": True}
+FAST = {
+    "nogil": True, "error_model": "numpy", "cache": True,
+    "fastmath": {"reassoc", "contract", "arcp", "nsz"},  # all but those that would let a NaN pass unseen
+}  # fmt: skip
 
 ZERO, HALF, ONE, TWO = f32(0.0), f32(0.5), f32(1.0), f32(2.0)
 TANH_IS_ONE = f32(7.9)

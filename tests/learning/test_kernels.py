@@ -70,3 +70,19 @@ def test_mish_far_out(sign):
     one, zero = torch.full((64,), float(x.std(correction=0))), torch.full((64,), float(x.mean()))
     kernels.norm_mish(*arrays(x, one, zero), 0.0, *arrays(torch.zeros(1, 1)), -1, *arrays(found, mean, rstd))
     assert torch.allclose(found, functional.mish(x), atol=1e-4, rtol=1e-5)
+
+
+def test_a_value_that_is_not_finite_stays_one():
+    """Not a number in one chunk is not a number in its result, and nowhere else."""
+    x, scale, offset, film = given(3, 2, 16, 1.0)
+    with torch.no_grad():
+        x[1, 0, 3] = torch.nan
+    found, mean, rstd = torch.empty_like(x), torch.empty(3, 4), torch.empty(3, 4)
+    kernels.norm_mish(*arrays(x, scale, offset), 1e-5, *arrays(film), 3, *arrays(found, mean, rstd))
+    bad = torch.zeros(3, 2, 16, dtype=torch.bool)
+    bad[1, :, :4] = True  # its group of channels
+    assert torch.equal(~torch.isfinite(found), bad)
+    own = [torch.empty_like(x), torch.empty(16), torch.empty(16), torch.zeros_like(film)]
+    kernels.norm_mish_back(*arrays(found, x, scale, offset, mean, rstd, film), 3, *arrays(*own))
+    assert torch.equal(~torch.isfinite(own[0]), bad)
+    assert not torch.isfinite(own[1][:4]).any() and torch.isfinite(own[1][4:]).all()
