@@ -70,6 +70,24 @@ def read_folder(folder: Path) -> Results:
     return Results(arms=tuple(a["name"] for a in arms), max_attempts=max_attempts, records=records)
 
 
+def read_folders(folders: Sequence[Path]) -> Results:
+    """Several folders side by side: other tasks, or other models of the same, under the arms that all of them have, by
+    name (their settings may differ, as tasks do). Raises ConfigError where they cannot be put side by side."""
+    found = [read_folder(folder) for folder in folders]
+    arms = tuple(a for a in found[0].arms if all(a in other.arms for other in found))
+    if not arms:
+        raise ConfigError(f"{' and '.join(map(str, folders))} have no arm of the same name")
+    if len({results.max_attempts for results in found}) > 1:
+        counts = ", ".join(f"{folder} {results.max_attempts}" for folder, results in zip(folders, found, strict=True))
+        raise ConfigError(f"the results allow different numbers of attempts: {counts}; report each")
+    records: dict[Cluster, Records] = {}
+    for folder, results in zip(folders, found, strict=True):
+        if twice := set(records) & set(results.records):
+            raise ConfigError(f"{folder} holds {' '.join(min(twice))} again, which another of the folders has")
+        records |= results.records
+    return Results(arms=arms, max_attempts=found[0].max_attempts, records=records)
+
+
 def markdown(results: Results) -> str:
     parts = [task_section(results, task) for task in results.tasks if results.clusters(task)]
     if len(parts) > 1:

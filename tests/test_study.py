@@ -9,7 +9,7 @@ import pytest
 from far_app.cli import main
 from far_app.errors import ConfigError
 from far_app.evaluation import REPORT_SCENES
-from far_app.report import Results, markdown, pooled, read_folder
+from far_app.report import Results, markdown, pooled, read_folder, read_folders
 from far_app.study import demonstrating, model_folder, read_study, training
 
 TEXT = """
@@ -156,3 +156,36 @@ def test_what_cannot_be_reported_together_is_named(tmp_path):
     plan.write_text(plan.read_text().replace("far", "rerank"))
     with pytest.raises(ConfigError, match=r"lift-1 compares other methods or settings than .*can-0"):
         read_folder(tmp_path)
+
+
+def one_task(task: str, arms: tuple[str, ...] = ("nr", "far")) -> Results:
+    records = {c: [r for r in rs if r["arm"] in arms] for c, rs in results().records.items() if c[0] == task}
+    return Results(arms=arms, max_attempts=2, records=records)
+
+
+def test_folders_side_by_side_share_a_table_under_the_arms_that_all_have(tmp_path, capsys):
+    lift, can = tmp_path / "lift", tmp_path / "can"
+    written_results(lift, one_task("lift"), "nr far rerank")
+    written_results(can, one_task("can"), "far nr")
+    both = read_folders([lift, can])
+    assert (both.arms, both.tasks) == (("nr", "far"), ["lift", "can"])
+    assert pooled(both, "far", "nr") == pooled(results(), "far", "nr")
+    assert main(["report", str(lift), str(can), "--out", str(tmp_path / "both")]) == 0
+    assert "## over tasks" in (tmp_path / "both" / "README.md").read_text()
+    assert main(["report", str(lift), str(can)]) == 2
+    assert "give --out" in capsys.readouterr().err
+
+
+def test_folders_that_cannot_stand_side_by_side_are_named(tmp_path):
+    lift, other = tmp_path / "lift", tmp_path / "other"
+    written_results(lift, one_task("lift"))
+    with pytest.raises(ConfigError, match="lift lift-0 again"):
+        read_folders([lift, lift])
+    written_results(other, one_task("can"), "bgr")
+    with pytest.raises(ConfigError, match="no arm of the same name"):
+        read_folders([lift, other])
+    plan = other / "can-0" / "plan.json"
+    for path in other.glob("*/plan.json"):
+        path.write_text(plan.read_text().replace("bgr", "nr").replace('"max_attempts": 2', '"max_attempts": 3'))
+    with pytest.raises(ConfigError, match=r"different numbers of attempts: .*lift 2, .*other 3"):
+        read_folders([lift, other])

@@ -9,7 +9,7 @@ from pathlib import Path
 import tyro
 
 from far_app.errors import ConfigError
-from far_app.report import markdown, read_folder
+from far_app.report import markdown, read_folders
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,7 +18,7 @@ class ReportOptions:
     sessions: a page with both, and every failure with its flagged moment."""
 
     folders: tyro.conf.Positional[tuple[Path, ...]]
-    """A folder that `far eval` or `far study` wrote, or recorded sessions."""
+    """What `far eval` or `far study` wrote, or recorded sessions; of several, results share a table."""
     out: Path | None = None
     """Of results: the folder to write to, by default their own. Of sessions: the page, by default
     report_SESSION.html here."""
@@ -34,9 +34,9 @@ def main(arguments: Sequence[str]) -> int:
     if not folders:
         raise ConfigError("nothing to report on; give a folder of far eval's results, or recorded sessions")
     if any(results_in(folder) for folder in folders):
-        if len(folders) > 1:
-            raise ConfigError("one folder of results at a time; several recorded sessions can share a page")
-        print(write_report(folders[0], options.out or folders[0]))
+        if len(folders) > 1 and options.out is None:
+            raise ConfigError("several folders of results have no place for one report; give --out")
+        print(write_report(folders, options.out or folders[0]))
     else:
         print(write_page(folders, options.out, options.overwrite, options.unblind))
     return 0
@@ -62,11 +62,11 @@ def write_page(folders: Sequence[Path], out: Path | None, overwrite: bool, unbli
     return target
 
 
-def write_report(folder: Path, target: Path) -> str:
+def write_report(folders: Sequence[Path], target: Path) -> str:
     """The report of what is there so far; its text."""
     from far_app.report_plot import draw
 
-    results = read_folder(folder)
+    results = read_folders(folders)
     text = markdown(results)
     target.mkdir(parents=True, exist_ok=True)
     draw(results, target / "success.png")

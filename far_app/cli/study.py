@@ -42,7 +42,7 @@ def main(arguments: Sequence[str]) -> int:
     for task, seed in study.models:
         print(f"{task.name}, training seed {seed}", flush=True)
         run_plan(folder / f"{task.name}-{seed}", study.plan(folder, task, seed), options.workers)
-    print(write_report(folder, folder))
+    print(write_report([folder], folder))
     return 0
 
 
