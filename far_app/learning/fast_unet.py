@@ -115,7 +115,8 @@ class FastUnet:
         self, noisy: Float[Tensor, "B H A"], k: Int[Tensor, "B"], condition: Float[Tensor, "B M"]
     ) -> Float[Tensor, "B H A"]:
         """ε_θ(a_k, s, k), the observation given by its `condition`."""
-        return self.filmed(noisy, self.leaves[0][k] + condition)
+        steps = self.leaves[0].index_select(0, k)  # indexing's gradient is summed in any order by several threads
+        return self.filmed(noisy, steps + condition)
 
     def filmed(self, noisy: Float[Tensor, "B H A"], film: Float[Tensor, "B M"]) -> Float[Tensor, "B H A"]:
         """The same, given what scales and shifts every block. No gradient comes back on the noisy chunk."""

@@ -103,7 +103,7 @@ def denoising_errors(
     for rows in torch.arange(len(noisy)).split(BATCH):
         check(cancelled)
         here, row = state[rows].unique(return_inverse=True)
-        predicted = denoiser.run(noisy[rows], k[rows], denoiser.condition(features[here])[row])
+        predicted = denoiser.run(noisy[rows], k[rows], denoiser.condition(features[here]).index_select(0, row))
         if predicted.requires_grad:
             predicted.register_hook(lambda _: check(cancelled))  # on the way back too, batch by batch
         squared = (noise[rows] - predicted)[..., :dims].square().flatten(1)

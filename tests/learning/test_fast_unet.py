@@ -59,3 +59,18 @@ def test_what_it_cannot_arrange_runs_plainly():
     assert arrangeable(unet((16, 32, 64)), 6) is None
     assert isinstance(trainable(unet((16, 32), kernel=5), 8), PlainDenoiser)
     assert isinstance(trainable(unet((16, 32)), 8), FastUnet)
+
+
+def test_the_gradient_repeats_to_the_bit_on_two_threads():
+    fast = FastUnet(unet((64, 128)), 8, train=True)
+    noisy, k, features = inputs(128)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        found = set()
+        for _ in range(10):
+            loss = fast(noisy, k, features).square().sum()
+            found.add(fast.pull_back(torch.autograd.grad(loss, fast.leaves)).numpy().tobytes())
+    finally:
+        torch.set_num_threads(threads)
+    assert len(found) == 1

@@ -65,12 +65,23 @@ def test_segments_never_cross_an_episode_and_chunks_repeat_the_last_action():
             assert np.allclose(chunks[row, -1], wanted)
 
 
+@pytest.fixture
+def one_thread():
+    """What `--threads 1` promises: the same weights to the bit. Libraries that share out sums may do it in any way."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("one_thread")
 def test_the_same_seed_gives_the_same_weights(tmp_path):
     first = train_policy(episodes(), CONFIG, TRAINING, tmp_path / "a")
     second = train_policy(episodes(), CONFIG, TRAINING, tmp_path / "b")
     assert fingerprint(load_policy(first)) == fingerprint(load_policy(second))
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_an_interrupted_run_ends_with_the_same_weights(tmp_path, monkeypatch):
     whole = train_policy(episodes(), CONFIG, TRAINING, tmp_path / "whole")
     calls = {"n": 0}
