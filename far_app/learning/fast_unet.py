@@ -121,23 +121,30 @@ class FastUnet:
     def filmed(self, noisy: Float[Tensor, "B H A"], film: Float[Tensor, "B M"]) -> Float[Tensor, "B H A"]:
         """The same, given what scales and shifts every block. No gradient comes back on the noisy chunk."""
         if self.train and torch.is_grad_enabled():
-            return _Pass.apply(self.layers, noisy, film, *self.leaves[2:])  # type: ignore[return-value]
+            return _Pass.apply(self.layers, self._matrices, noisy, film, *self.leaves[2:])  # type: ignore[return-value]
         return self.layers.forward(noisy.contiguous(), film, self._matrices)
 
 
 class _Pass(torch.autograd.Function):
-    """The layers, which know their own way back, as autograd sees them: one operation."""
+    """The layers, which know their own way back, as autograd sees them: one operation of the leaves."""
 
     @staticmethod
-    def forward(ctx, layers: Layers, noisy: Tensor, film: Tensor, *matrices: Tensor) -> Tensor:  # noqa: ANN001
-        ctx.layers, ctx.film, ctx.matrices, ctx.kept = layers, film.detach(), [m.detach() for m in matrices], []
+    def forward(
+        ctx,
+        layers: Layers,
+        matrices: Sequence[Tensor],
+        noisy: Tensor,
+        film: Tensor,
+        *leaves: Tensor,  # noqa: ANN001
+    ) -> Tensor:
+        ctx.layers, ctx.film, ctx.matrices, ctx.kept = layers, film.detach(), matrices, []
         return layers.forward(noisy.detach().contiguous(), ctx.film, ctx.matrices, ctx.kept)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient: Tensor) -> tuple[Any, ...]:  # noqa: ANN001
         into, to_film = ctx.layers.back(gradient.contiguous(), ctx.film, ctx.matrices, ctx.kept)
-        return None, None, to_film, *into
+        return None, None, None, to_film, *into
 
 
 class _Given(torch.autograd.Function):

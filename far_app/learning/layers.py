@@ -131,7 +131,7 @@ class Convolved:
 
 @dataclass(frozen=True)
 class Residual:
-    """second(first(x)) + x, or + x W where the widths differ; the first is filmed."""
+    """second(first(x)) + x, or + x Wᵀ where the widths differ; the first is filmed."""
 
     first: Convolved
     second: Convolved
