@@ -35,6 +35,8 @@ BACKGROUND_NICENESS = -5
 
 SWITCH_INTERVAL = 1e-4
 """Seconds a thread that wants the interpreter waits before it asks the holder for it (sys.setswitchinterval)."""
+KEEP_INTERVAL = 1e-3
+"""The same between a tick's deadline and its target: the loop's few lines are not to be taken apart by others."""
 
 _PR_SET_TIMERSLACK = 29
 _TIMER_SLACK_NS = 1000

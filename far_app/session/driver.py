@@ -20,7 +20,7 @@ from far_app.session.inbox import IntentInbox
 from far_app.session.lessons import Lessons
 from far_app.session.operator import Operator
 from far_app.session.planners import ThreadedPlanner
-from far_app.session.realtime import collect_between
+from far_app.session.realtime import collect_between, keep_interpreter, share_interpreter
 from far_app.session.settings import SessionSettings
 from far_app.session.standing import IN_ATTEMPT, Standing
 from far_app.session.statistics import LoopStatistics
@@ -94,6 +94,7 @@ class Driver:
     def _pass_tick(self, tick: Tick) -> float:
         """Bookkeeping of the last tick, then wait for this one's deadline and attend to what happened."""
         timeline = self.statistics.timeline
+        share_interpreter()
         self.planner.go()
         timeline.lap(AGGREGATE)
         if tick.step is not None and tick.step.tick == self.recorded:
@@ -106,6 +107,7 @@ class Driver:
         self.standing.show()
         timeline.lap(PUBLISH)
         due = self.clock.wait()
+        keep_interpreter()  # until the target is on its way, at the top of the next call
         timeline.begin(self._tick - tick.between if tick.phase == "attempt" else -1, due)
         held = self.supervision.attend(tick.phase)
         if held and tick.phase == "attempt" and self.standing.state in IN_ATTEMPT:

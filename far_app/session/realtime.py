@@ -1,12 +1,13 @@
-"""What keeps a Python loop on time beside its priority: a short switch interval, the collector outside attempts."""
+"""What keeps a Python loop on time beside its priority: who has the interpreter, the collector outside attempts."""
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import math
 import sys
 
-from far_app.scheduling import SWITCH_INTERVAL
+from far_app.scheduling import KEEP_INTERVAL, SWITCH_INTERVAL
 
 
 def prepare_process(torch_threads: int) -> None:
@@ -18,6 +19,19 @@ def prepare_process(torch_threads: int) -> None:
     sys.setswitchinterval(SWITCH_INTERVAL)
     gc.collect()
     gc.freeze()
+
+
+def keep_interpreter() -> None:
+    """In a prepared process, from now on others wait longer before they ask for the interpreter. For the one loop of a
+    process, and for a moment: each turn taken in between would be some tenths of a ms until it comes back."""
+    if sys.getswitchinterval() < KEEP_INTERVAL:
+        sys.setswitchinterval(KEEP_INTERVAL)
+
+
+def share_interpreter() -> None:
+    """As usual again."""
+    if math.isclose(sys.getswitchinterval(), KEEP_INTERVAL):
+        sys.setswitchinterval(SWITCH_INTERVAL)
 
 
 @contextlib.contextmanager
