@@ -1,4 +1,4 @@
-"""`far report`: what a folder of results says (Markdown and a picture), or recorded sessions (one HTML page)."""
+"""`far report`: what results or improvements say (Markdown and a picture), or recorded sessions (one HTML page)."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from pathlib import Path
 import tyro
 
 from far_app.errors import ConfigError
+from far_app.improvement_report import improvements_in
 from far_app.report import markdown, read_folders
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportOptions:
-    """Of results: tables with intervals and tests (README.md), and success by attempt (success.png). Of recorded
-    sessions: a page with both, and every failure with its flagged moment."""
+    """Of results: tables with intervals and tests (README.md), and success by attempt (success.png). Of improvements:
+    the same, by epoch. Of recorded sessions: a page with both, and every failure with its flagged moment."""
 
     folders: tyro.conf.Positional[tuple[Path, ...]]
-    """What `far eval` or `far study` wrote, or recorded sessions; of several, results share a table."""
+    """What `far eval` or `far study` wrote, or `far improve`, or recorded sessions; several share a table."""
     out: Path | None = None
     """Of results: the folder to write to, by default their own. Of sessions: the page, by default
     report_SESSION.html here."""
@@ -33,10 +34,14 @@ def main(arguments: Sequence[str]) -> int:
     folders = list(options.folders)
     if not folders:
         raise ConfigError("nothing to report on; give a folder of far eval's results, or recorded sessions")
-    if any(results_in(folder) for folder in folders):
+    improved, compared = ([f for f in folders if kind(f)] for kind in (improvements_in, results_in))
+    if improved and len(improved) < len(folders):
+        raise ConfigError(f"{improved[0]} is an improvement, not all of the others are; report on each kind by itself")
+    if improved or compared:
         if len(folders) > 1 and options.out is None:
             raise ConfigError("several folders of results have no place for one report; give --out")
-        print(write_report(folders, options.out or folders[0]))
+        write = write_improvements if improved else write_report
+        print(write(folders, options.out or folders[0]))
     else:
         print(write_page(folders, options.out, options.overwrite, options.unblind))
     return 0
@@ -44,7 +49,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def results_in(folder: Path) -> bool:
     """Whether `far eval` or `far study` wrote it."""
-    if (folder / "session.json").exists():
+    if (folder / "session.json").exists() or improvements_in(folder):
         return False
     return (folder / "plan.json").exists() or any(folder.glob("*/plan.json"))
 
@@ -71,4 +76,16 @@ def write_report(folders: Sequence[Path], target: Path) -> str:
     target.mkdir(parents=True, exist_ok=True)
     draw(results, target / "success.png")
     (target / "README.md").write_text(text + "\n![Success by attempt](success.png)\n")
+    return text
+
+
+def write_improvements(folders: Sequence[Path], target: Path) -> str:
+    """The report of what `far improve` found so far; its text."""
+    from far_app.improvement_report import curves, draw, markdown
+
+    found = curves(folders)
+    text = markdown(found)
+    target.mkdir(parents=True, exist_ok=True)
+    draw(found, target / "improvement.png")
+    (target / "README.md").write_text(text + "\n![Success by episodes and ticks](improvement.png)\n")
     return text
