@@ -1,40 +1,35 @@
 """The one implementation behind nr, perturb, fcpa and far: learn from a failure, perturb the retry, or neither.
 
-A failure is learnt from in four steps (paper, Algorithm 1), on a private copy of the denoiser; only when all are done
-does the acting policy change, at once, to a new version. The base network is never written to, so the base policy's
-return at a trial's end is exact.
+A lesson (lesson.py) is learnt on a private copy of the denoiser; only when it is done does the acting policy change, at
+once, to a new version. The base network is never written to, so the base policy's return at a trial's end is exact.
 """
 
 from __future__ import annotations
 
 import copy
 import threading
-import time
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
-import numpy as np
-import torch
-from torch import Tensor, nn
+from torch import nn
 
 from far_app.config import RetryConfig
 from far_app.errors import ConfigError, FarError
-from far_app.learning import diffusion, fcpa
+from far_app.learning import fcpa
 from far_app.learning.adapted import denoiser_of
 from far_app.learning.cancellation import AdaptationCancelledError, Cancelled, abandonable, check
 from far_app.learning.critic import Critic
 from far_app.learning.memory import FeatureMemory
-from far_app.learning.pairs import Pairs, candidates, explored, merged, select, weighted_trajectory
+from far_app.learning.pairs import Pairs
 from far_app.learning.policy import DiffusionPolicy, fingerprint
-from far_app.learning.preference import Demonstrations, Noising
+from far_app.learning.preference import Demonstrations
 from far_app.learning.steering import Steering
 from far_app.learning.trainable import Arrange, trainable
 from far_app.methods import evidence
-from far_app.methods.evidence import sent_chunks
+from far_app.methods.lesson import Learner, Lesson
 from far_app.perturbation import Perturbation, perturbation
 from far_app.protocols import Policy, Progress
-from far_app.seeding import generator
-from far_app.types import Adaptation, AdaptationStep, AdaptedWeights, Attempt
+from far_app.types import Adaptation, AdaptedWeights, Attempt
 
 
 class Act(Protocol):
@@ -109,24 +104,24 @@ class RetryMethod:
         nothing = evidence.unlearnt(attempt, version, self.policy.spec.horizon)
         if not self.adapts:
             return nothing
-        learning = _Learning(self, attempt, outdated, nothing)
+        lesson = Lesson(self._learner(), attempt, outdated, nothing)
         try:
             if self.config.fcpa.hedge and version != self._base_policy.version:
-                learning.attribute(progress)
+                lesson.attribute(progress)
                 self._withdraw(outdated)
-                learning.note(
+                lesson.note(
                     status="withdrawn", version=self._base_policy.version, note="the lesson failed: a plain try next"
                 )
-                return learning.adaptation
-            denoiser, pairs = learning.run(progress)
+                return lesson.adaptation
+            denoiser, pairs = lesson.run(progress)
             if denoiser is not None:
                 self._become(denoiser, pairs, outdated)
-                learning.note("engine", version=self.policy.version)
+                lesson.note("engine", version=self.policy.version)
         except AdaptationCancelledError:
-            learning.note(status="cancelled")
+            lesson.note(status="cancelled")
         except FarError as error:
-            learning.note(status="failed", note=str(error))
-        return learning.adaptation
+            lesson.note(status="failed", note=str(error))
+        return lesson.adaptation
 
     def use(self, weights: AdaptedWeights | None, version: str, *, base: bool) -> None:
         """far_app.protocols.ChangesWeights."""
@@ -143,6 +138,14 @@ class RetryMethod:
 
     def perturb(self, attempt_index: int, scene_seed: int) -> Perturbation:
         return perturbation(self.perturbation, scene_seed, attempt_index)
+
+    def _learner(self) -> Learner:
+        assert self.critic is not None, "checked when the method was made"
+        return Learner(
+            spec=self.policy.spec, version=self.policy.version, acting=self.acting, base=self.base,
+            critic=self.critic, config=self.config, memory=self.memory, demonstrations=self.demonstrations,
+            arrange=self.arrange, rounds=self.rounds,
+        )  # fmt: skip
 
     def _restore(self) -> None:
         self._trial += 1
@@ -183,103 +186,3 @@ def with_denoiser(network: DiffusionPolicy, denoiser: nn.Module) -> DiffusionPol
     other = copy.copy(network)
     other._modules = {**network._modules, "denoiser": denoiser}
     return other
-
-
-class _Learning:
-    """One failure's lesson: attribution → candidates → pairs → update, each timed."""
-
-    def __init__(self, method: RetryMethod, attempt: Attempt, cancelled: Cancelled, nothing: Adaptation) -> None:
-        self.method, self.attempt, self.cancelled, self.adaptation = method, attempt, cancelled, nothing
-        self.history: list[AdaptationStep] = []
-        self._last = time.monotonic()
-
-    def note(self, stage: str = "", **changes: object) -> None:
-        """Write down what is known so far, and the seconds since the last stage ended."""
-        seconds = dict(self.adaptation.seconds)
-        if stage:
-            now = time.monotonic()
-            seconds[stage] = now - self._last
-            self._last = now
-        self.adaptation = replace(self.adaptation, seconds=seconds, **changes)
-
-    def attribute(self, progress: Progress) -> evidence.Eyes:
-        """Find the chunks to blame; returns the eyes that did."""
-        method = self.method
-        assert method.critic is not None, "checked when the method was made"
-        eyes = evidence.Eyes(policy=method.base, critic=method.critic, memory=method.memory)
-        self.adaptation = evidence.attributed(
-            self.adaptation, self.attempt, eyes, method.config.attribution, self.cancelled
-        )
-        self.note("attribution")
-        progress(self.adaptation)
-        return eyes
-
-    def run(self, progress: Progress) -> tuple[nn.Module | None, Pairs]:
-        """The adapted denoiser (None when nothing changed) and the pairs it learnt from."""
-        method, config = self.method, self.method.config
-        eyes = self.attribute(progress)
-        awr = config.fcpa.objective == "awr"
-        pairs = self._trajectory(eyes) if awr else self._pairs(eyes, self.adaptation.flagged)
-        self.note("pairs", pairs=len(pairs), empty_states=pairs.empty_states)
-        progress(self.adaptation)
-        if not len(pairs):
-            self.note(status="empty", note="no chunk could be paired")
-            return None, pairs
-
-        accumulate = config.fcpa.accumulate
-        denoiser = copy.deepcopy((method.acting if accumulate else method.base).denoiser).requires_grad_(True).eval()
-        update = fcpa.adapt(
-            denoiser, Noising(add_noise=diffusion.add_noise, steps=diffusion.TRAIN_STEPS),
-            pairs if accumulate else merged([*method.rounds, pairs]), config.fcpa, self._rng("fcpa"), self.cancelled,
-            lambda step: (self.history.append(step), progress(step))[1], method.demonstrations,
-            method.arrange,
-        )  # fmt: skip
-        denoiser.requires_grad_(False)
-        self.note("update", status=update.status, history=update.history, note=update.note)
-        return (denoiser if update.changed else None), pairs
-
-    def _pairs(self, eyes: evidence.Eyes, ticks: tuple[int, ...]) -> Pairs:
-        """Candidates under the policy that acted, filtered and ranked, for every flagged chunk."""
-        method, config, critic = self.method, self.method.config.pairs, eyes.critic
-        spec = method.policy.spec
-        seen = eyes.own(self.attempt, ticks, self.cancelled)
-        shown = eyes.critics(self.attempt, ticks, self.cancelled)
-        negatives = torch.from_numpy(sent_chunks(self.attempt, ticks, spec.horizon)).to(seen.device)
-        shape = (config.candidates, spec.horizon, spec.action_dim)
-        noise = [self._rng("candidates", t).standard_normal(shape, dtype=np.float32) for t in ticks]
-        self.note("encoding")
-
-        runner = method.arrange(method.acting.denoiser, spec.horizon, train=False)
-
-        def denoiser(noisy: Tensor, k: Tensor, condition: Tensor) -> Tensor:
-            check(self.cancelled)
-            return runner.run(noisy, k, condition)
-
-        def sample(condition: Tensor, start: Tensor) -> Tensor:
-            return diffusion.ddim_sample(denoiser, condition, start, method.base.config.ddim_steps)
-
-        with torch.no_grad():
-            stacked = torch.from_numpy(np.stack(noise)) if noise else torch.zeros(0, *shape)
-            chunks = candidates(sample, runner.condition(seen), stacked.to(seen.device), self.cancelled)
-            if not bool(torch.isfinite(chunks).all()):
-                raise FarError(f"the policy {method.policy.version} sampled a non-finite candidate; nothing was learnt")
-            if config.explore > 0:
-                chunks = explored(chunks, config.explore, self._rng("exploration"))
-            self.note("candidates")
-            pairs = select(chunks, seen, negatives, critic.q, config, shown)
-            self.note(contrasts=evidence.contrasts(pairs, ticks, shown, critic, config.arm_only))
-            return pairs
-
-    def _trajectory(self, eyes: evidence.Eyes) -> Pairs:
-        """Every whole chunk of the attempt, weighted by its advantage (the awr objective)."""
-        horizon = self.method.policy.spec.horizon
-        ticks = range(len(self.attempt.steps) - horizon + 1)
-        seen = eyes.own(self.attempt, ticks, self.cancelled)
-        shown = eyes.critics(self.attempt, ticks, self.cancelled)
-        chunks = torch.from_numpy(sent_chunks(self.attempt, ticks, horizon)).to(seen.device)
-        with torch.no_grad():
-            advantages = eyes.critic.q(shown, chunks) - eyes.critic.value(shown)
-            return weighted_trajectory(seen, chunks, advantages)
-
-    def _rng(self, purpose: str, *key: int) -> np.random.Generator:
-        return generator(purpose, self.attempt.scene_seed, self.attempt.index, *key)
