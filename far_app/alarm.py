@@ -5,7 +5,7 @@
 
 An attempt is ended when either score passes its limit. A limit is the split-conformal quantile of the scores' maxima
 over attempts that succeeded: of new successes at most `false_alarm` are lost, half of that by either score. Pure;
-asked by far_app/trial.py.
+asked by far_app/attempt.py.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A learned detector: far_app/learning/success.py.
 
-The horizon and a latched arm end an attempt in far_app/trial.py itself.
+The horizon and a latched arm end an attempt in far_app/attempt.py itself.
 """
 
 from __future__ import annotations

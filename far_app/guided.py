@@ -2,43 +2,40 @@
 
     a_t = (pose_t → pose_{t+1}) as an action of the rig's scale          the gripper: as the person asked for it
 
-One trial of one attempt, with the events of far_app/trial.py, so that the session drives, records and judges it like
+One trial of one attempt, with the events of far_app/events.py, so that the session drives, records and judges it like
 any other. The arm is made compliant by a Guide request and stiff again at the end, whatever ends it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator
 from dataclasses import replace
 
 import numpy as np
 
-from far_app.config import TaskConfig
+from far_app.attempt import HELP_LIMIT, Setting, fault
+from far_app.events import AfterHold, AttemptEnded, AttemptEvents, AttemptStarted, Tick, TrialEvents
 from far_app.motion import ActionScale, action_between
-from far_app.protocols import Guide, Heartbeat, Person, Reset, Robot, SuccessDetector
-from far_app.trial import HELP_LIMIT, AfterHold, AttemptEnded, AttemptStarted, Event, Tick, TrialEvents, fault, go_home
-from far_app.types import ActionChunk, Attempt, Judge, Observation, Outcome, Step, Trial
+from far_app.protocols import Guide, Heartbeat, Reset
+from far_app.trial import go_home
+from far_app.types import Attempt, Judge, Observation, Outcome, Step, Trial
 
 VERSION = "a person"
 """In place of a policy's version."""
 
 
-def guided_trial(
-    scene_seed: int, robot: Robot, detector: SuccessDetector, task: TaskConfig, scale: ActionScale, person: Person
-) -> TrialEvents:
+def guided_trial(scene_seed: int, setting: Setting) -> TrialEvents:
     """Home, then the person's hands until somebody judges. Raises RobotError where the arm cannot be led by hand."""
-    robot.request(Reset(seed=scene_seed))
-    yield from go_home(robot, attempt_index=1)
+    setting.robot.request(Reset(seed=scene_seed))
+    yield from go_home(setting.robot, attempt_index=1)
     yield AttemptStarted(attempt_index=1, policy_version=VERSION)
-    attempt = yield from led(robot, detector, scale, scene_seed, person)
+    attempt = yield from led(setting, scene_seed)
     yield AttemptEnded(attempt=attempt, last=True)
     return Trial(scene_seed=scene_seed, attempts=(attempt,), adaptations=())
 
 
-def led(
-    robot: Robot, detector: SuccessDetector, scale: ActionScale, scene_seed: int, person: Person
-) -> Generator[Event, float | ActionChunk | None, Attempt]:
+def led(setting: Setting, scene_seed: int) -> AttemptEvents:
     """One attempt. A tick: observe → what the last tick's motion was → judge."""
+    robot, detector, scale, person = setting.robot, setting.detector, setting.scale, setting.person
     steps: list[Step] = []
     detector.begin()
     leading = False

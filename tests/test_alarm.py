@@ -17,6 +17,7 @@ from far_app.alarm import (
     passed,
     read_limits,
 )
+from far_app.attempt import Setting
 from far_app.bench.alarm import ended, report
 from far_app.cli.train_alarm import Heard
 from far_app.detectors import TwinCheck
@@ -90,10 +91,11 @@ def test_an_attempt_that_gets_nowhere_ends_early_and_counts_as_a_failure_to_lear
 
     def run(alarm):
         clock = iter(range(10**6))
-        events = trial(
-            0, KinematicRobot(), LockstepPlanner(), Faster(Forward(speed=0.0)), TwinCheck(2), once, ActionScale(),
-            adapt_at_once, alarm=alarm,
+        setting = Setting(
+            robot=KinematicRobot(), planner=LockstepPlanner(), detector=TwinCheck(2), task=once, scale=ActionScale(),
+            alarm=alarm,
         )  # fmt: skip
+        events = trial(0, Faster(Forward(speed=0.0)), setting, adapt_at_once)
         return run_lockstep(events, lambda: 1000.0 + next(clock) / 30).attempts[0]
 
     listening = Listening()

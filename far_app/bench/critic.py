@@ -70,6 +70,7 @@ def main(arguments: Sequence[str]) -> int:
 def measure(options: CriticOptions) -> dict[str, Any]:
     import torch
 
+    from far_app.attempt import Setting
     from far_app.cli.assemble import assemble, shipped, trained
     from far_app.cli.lockstep_twin import lockstep_twin
     from far_app.detectors import TwinCheck
@@ -96,10 +97,11 @@ def measure(options: CriticOptions) -> dict[str, Any]:
     failures, scene = 0, options.first_scene
     with tqdm(total=options.failures, unit="failure", leave=False) as bar:
         while failures < options.failures:
-            result = run_lockstep(
-                trial(scene, robot, LockstepPlanner(), method, TwinCheck(task.success_ticks), task, robot.scale,
-                      adapt_at_once), robot.advance,
+            setting = Setting(
+                robot=robot, planner=LockstepPlanner(), detector=TwinCheck(task.success_ticks), task=task,
+                scale=robot.scale,
             )  # fmt: skip
+            result = run_lockstep(trial(scene, method, setting, adapt_at_once), robot.advance)
             scene += 1
             attempt = result.attempts[0]
             if attempt.outcome.success:

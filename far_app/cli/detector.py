@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from far_app.alarm import Alarm, FailureAlarm, read_limits
+from far_app.attempt import NO_ALARM
 from far_app.cli.assemble import checkpoints
 from far_app.protocols import SuccessDetector
-from far_app.trial import NO_ALARM
 
 if TYPE_CHECKING:
     from far_app.cli.options import RunOptions

@@ -77,20 +77,21 @@ def side_by_side(
 ) -> Iterator[tuple[J, Trial]]:
     """Trials of whatever `take` hands out; `cast` names the scene of a job and its method on a lane; an alarm for each
     robot, or none."""
+    from far_app.attempt import NO_ALARM, Setting
     from far_app.detectors import TwinCheck
     from far_app.session.lockstep import Lane, adapt_at_once, run_together
     from far_app.session.planners import LockstepPlanner
-    from far_app.trial import NO_ALARM, trial
+    from far_app.trial import trial
 
     def start(job: J, lane: int) -> Lane:
         robot = robots[lane]
         robot.request(Resume())
         scene, method = cast(job, lane)
-        events = trial(
-            scene, robot, LockstepPlanner(), method, TwinCheck(task.success_ticks), task, robot.scale, adapt_at_once,
-            alarm=alarms[lane] if alarms else NO_ALARM,
+        setting = Setting(
+            robot=robot, planner=LockstepPlanner(), detector=TwinCheck(task.success_ticks), task=task,
+            scale=robot.scale, alarm=alarms[lane] if alarms else NO_ALARM,
         )  # fmt: skip
-        return Lane(events, robot.advance, robot.free)
+        return Lane(trial(scene, method, setting, adapt_at_once), robot.advance, robot.free)
 
     def failed(job: J, lane: Lane, error: RobotError) -> Trial:
         """The arm latched too often: the trial ends as it stands."""

@@ -1,4 +1,4 @@
-"""Drives one trial after another in real time: answers each event that far_app/trial.py yields.
+"""Drives one trial after another in real time: answers each of far_app/events.py.
 
     Tick             record and show the last one, wait for this one's deadline, attend to what happened meanwhile
     AttemptStarted   count down, open the recording, wait for the first chunk
@@ -14,6 +14,7 @@ import logging
 import time
 
 from far_app.detectors import OperatorOverride
+from far_app.events import Adapted, AfterHold, AttemptEnded, AttemptStarted, Event, Tick
 from far_app.protocols import EngineReport, Method, PlanRequest, RunsOnEngine
 from far_app.session.clock import TickClock
 from far_app.session.inbox import IntentInbox
@@ -29,7 +30,6 @@ from far_app.session.supervision import Supervision, TrialAbandoned
 from far_app.session.timeline import AGGREGATE, INFER, OBSERVE, PUBLISH, RECORD
 from far_app.session.versions import VersionKeeper
 from far_app.session_states import Happening, Intent, State
-from far_app.trial import Adapted, AfterHold, AttemptEnded, AttemptStarted, Event, Tick
 from far_app.types import Attempt, Step
 from far_app.what_if import CorrectFlag
 

@@ -10,9 +10,10 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from far_app.errors import RobotError
+from far_app.events import Adapted, AttemptEnded, Tick, TrialEvents
 from far_app.protocols import Method, PlanRequest
 from far_app.session.planners import plan_one, plan_together
-from far_app.trial import Adapted, AttemptEnded, RunningAdaptation, Tick, TrialEvents
+from far_app.trial import RunningAdaptation
 from far_app.types import ActionChunk, Adaptation, Attempt, Judge, Trial
 
 Advance = Callable[[], float]

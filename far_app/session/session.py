@@ -14,9 +14,11 @@ import logging
 from dataclasses import replace
 
 from far_app.alarm import Alarm
+from far_app.attempt import NO_ALARM, Setting
 from far_app.config import TaskConfig
 from far_app.detectors import OperatorOverride
 from far_app.errors import RobotError
+from far_app.events import TrialEvents
 from far_app.guided import guided_trial
 from far_app.motion import ActionScale
 from far_app.protocols import Hold, Method, Robot, SuccessDetector
@@ -42,7 +44,7 @@ from far_app.session.supervision import Supervision, TrialAbandoned
 from far_app.session.versions import VersionKeeper
 from far_app.session.watched import WatchedRobot
 from far_app.session_states import Happening, Intent, State
-from far_app.trial import NO_ALARM, TrialEvents, trial
+from far_app.trial import trial
 from far_app.types import Trial
 
 log = logging.getLogger(__name__)
@@ -183,12 +185,13 @@ class Session:
 
     def _events(self, asked: Assignment, task: TaskConfig, chance: int, stretch: int) -> TrialEvents:
         """What happens on this scene: Algorithm 1, or a person leading the arm by hand."""
-        if self.settings.demonstrate == "hand":
-            return guided_trial(asked.seed, self.robot, self.detector, task, self.scale, self.helper)
-        return trial(
-            asked.seed, self.robot, self.planner, asked.method, self.detector, task, self.scale, self.lessons.start,
-            stretch, self.alarm, self.helper, chance,
+        setting = Setting(
+            robot=self.robot, planner=self.planner, detector=self.detector, task=task, scale=self.scale,
+            alarm=self.alarm, person=self.helper, stretch=stretch,
         )  # fmt: skip
+        if self.settings.demonstrate == "hand":
+            return guided_trial(asked.seed, setting)
+        return trial(asked.seed, asked.method, setting, self.lessons.start, chance)
 
     def _account(self, seed: int, max_attempts: int) -> TrialResult:
         """The trial's row and result."""

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from far_app.attempt import Setting
 from far_app.detectors import TwinCheck
 from far_app.errors import PolicyError
 from far_app.motion import ActionScale
@@ -72,10 +73,11 @@ def lockstep_trial(delay_ticks: int = 0, speed: float = 0.5):
     robot, policy = KinematicRobot(), Forward(speed=speed)
     clock = iter(range(10**6))
     now = time.monotonic()
-    events = trial(
-        7, robot, LockstepPlanner(delay_ticks), Faster(policy), TwinCheck(2),
-        replace(task("lift"), horizon=20, max_attempts=3), ActionScale(), adapt_at_once,
+    setting = Setting(
+        robot=robot, planner=LockstepPlanner(delay_ticks), detector=TwinCheck(2),
+        task=replace(task("lift"), horizon=20, max_attempts=3), scale=ActionScale(),
     )  # fmt: skip
+    events = trial(7, Faster(policy), setting, adapt_at_once)
     result = run_lockstep(events, lambda: now + 1000 + next(clock) / 30)
     return result, policy
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from far_app.attempt import FADE_IN
 from far_app.detectors import PersonJudge
 from far_app.device_input import DeviceInput
 from far_app.motion import ActionScale
@@ -19,7 +20,6 @@ from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
 from far_app.session_states import Intent, State
 from far_app.take_over import PACE, PAGE_SILENT, Move, Nudge
-from far_app.trial import FADE_IN
 from tests.session.kinematic import Forward, KinematicRobot
 from tests.session.test_session import Desk
 

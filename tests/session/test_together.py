@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from far_app.attempt import Setting
 from far_app.detectors import TwinCheck
 from far_app.errors import RobotError
 from far_app.motion import ActionScale
@@ -18,13 +19,16 @@ from tests.session.kinematic import Faster, Forward, KinematicRobot
 TASK = replace(task("lift"), horizon=20, max_attempts=3)
 
 
+def setting(robot: KinematicRobot) -> Setting:
+    return Setting(
+        robot=robot, planner=LockstepPlanner(), detector=TwinCheck(2), task=TASK, scale=ActionScale()
+    )  # fmt: skip
+
+
 def begun(scene: int, lane: int = 0):
     """Scene n is solved at speed 0.1 (n + 1): some at once, some after lessons, some never."""
     clock = iter(range(10**6))
-    events = trial(
-        scene, KinematicRobot(), LockstepPlanner(), Faster(Forward(speed=0.1 * (scene + 1))), TwinCheck(2), TASK,
-        ActionScale(), adapt_at_once,
-    )  # fmt: skip
+    events = trial(scene, Faster(Forward(speed=0.1 * (scene + 1))), setting(KinematicRobot()), adapt_at_once)
     return Lane(events, lambda: 1000.0 + next(clock) / 30)
 
 
@@ -101,9 +105,7 @@ def caught(every: int, times: int) -> Lane:
         robot.request(Home())
         return True
 
-    events = trial(
-        0, robot, LockstepPlanner(), Faster(Forward(speed=0.1)), TwinCheck(2), TASK, ActionScale(), adapt_at_once
-    )
+    events = trial(0, Faster(Forward(speed=0.1)), setting(robot), adapt_at_once)
     return Lane(events, advance, free)
 
 
