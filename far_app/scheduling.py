@@ -51,6 +51,18 @@ def nice(niceness: int) -> bool:
     return True
 
 
+def nice_threads(niceness: int) -> bool:
+    """The niceness of every thread that this process has so far, those of libraries too; later ones begin with that of
+    the thread that starts them. False where not permitted."""
+    try:
+        for thread in os.listdir("/proc/self/task"):
+            with contextlib.suppress(ProcessLookupError):
+                os.setpriority(os.PRIO_PROCESS, int(thread), niceness)
+    except OSError:
+        return False
+    return True
+
+
 def real_time(priority: int, niceness: int = PROMPT_NICENESS) -> str:
     """The best the calling thread can get: "fifo", "nice" or "normal"; and timers exact to a microsecond. Threads and
     processes that it starts begin at the usual priority."""

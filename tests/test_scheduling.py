@@ -6,7 +6,7 @@ import threading
 import zmq
 
 from far_app import scheduling
-from far_app.scheduling import LOOP_PRIORITY, prompt_context, real_time_inside
+from far_app.scheduling import LOOP_PRIORITY, nice_threads, prompt_context, real_time_inside
 
 
 def policy() -> int:
@@ -42,6 +42,24 @@ def test_a_prompt_context_carries_messages_with_and_without_the_right(monkeypatc
         assert policy() == os.SCHED_OTHER, "the priority was the context's, not ours"
         context.destroy(linger=0)
         refuse(monkeypatch)
+
+
+def test_the_niceness_of_all_threads_is_that_of_those_already_there_too(monkeypatch):
+    told, go_on = [], threading.Event()
+
+    def wait() -> None:
+        go_on.wait(10)
+        told.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    allowed = nice_threads(-1)
+    go_on.set()
+    thread.join()
+    assert told == [-1 if allowed else 0]
+    nice_threads(0)
+    refuse(monkeypatch)
+    assert not nice_threads(-1)
 
 
 def refuse(monkeypatch) -> None:

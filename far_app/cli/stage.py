@@ -29,7 +29,7 @@ from far_app.link import RemoteRobot
 from far_app.protocols import Method, PlanRequest, Policy, SuccessDetector
 from far_app.recording.schema import SessionInfo
 from far_app.recording.writer import SessionWriter
-from far_app.scheduling import PROMPT_NICENESS, nice
+from far_app.scheduling import PROMPT_NICENESS, nice_threads
 from far_app.session.course import Course
 from far_app.session.inbox import IntentInbox
 from far_app.session.planners import ThreadedPlanner, plan_one
@@ -183,8 +183,8 @@ def stage(options: RunOptions, assembling: Assembling = one_method, *, person: b
         task = dataclasses.replace(task, max_attempts=1 if options.shadow else attempts)
         # From here on this process's threads come before the machine's others: one that is not scheduled while it holds
         # the interpreter would keep the loop waiting. The processes above were started before, at the usual priority.
-        nice(PROMPT_NICENESS)
-        stack.callback(nice, 0)
+        nice_threads(PROMPT_NICENESS)
+        stack.callback(nice_threads, 0)
         robot = stack.enter_context(connected(folder, hardware))
         if page is not None:
             wait_for_page(page, options.page_host, port)

@@ -11,7 +11,7 @@ from functools import partial
 
 from far_app.learning.engines.arranged import unusable as unarranged
 from far_app.learning.engines.openvino_encoder import OpenVinoCameras
-from far_app.learning.engines.openvino_unet import OpenVinoUnet, available
+from far_app.learning.engines.openvino_unet import OpenVinoChain, available
 from far_app.learning.engines.protocol import EngineError, Entry
 from far_app.learning.engines.stepwise import Frames, StepwiseEngine
 from far_app.learning.fast_unet import FastUnet
@@ -24,20 +24,21 @@ def make(
     """`precision` is that of the camera networks; the U-Net stays in f32: bf16 makes a step a sixth faster, and an
     error that sixteen steps add up."""
 
-    def unet(network: DiffusionPolicy) -> OpenVinoUnet:
-        return OpenVinoUnet(FastUnet(network.denoiser, network.config.horizon))
+    def chain(network: DiffusionPolicy) -> OpenVinoChain:
+        return OpenVinoChain(FastUnet(network.denoiser, network.config.horizon), network.config.ddim_steps)
 
     try:
-        cameras = OpenVinoCameras(network.encoder, network.config.image_size, precision, camera_threads(network))
-        return StepwiseEngine(name, network, version, Frames(network, cameras, each_alone), unet)
+        together = worth_sharing(network) and not each_alone
+        cameras = OpenVinoCameras(network.encoder, network.config.image_size, precision, together)
+        return StepwiseEngine(name, network, version, Frames(network, cameras, each_alone), chain)
     except (ImportError, RuntimeError) as error:
         raise EngineError(f"OpenVINO could not build it: {error}") from error
 
 
-def camera_threads(network: DiffusionPolicy) -> int:
-    """Two for the paper's networks, whose four pictures take longer than a tick on one; a U-Net step is too short to be
-    shared."""
-    return min(2, os.cpu_count() or 1) if network.config.encoder == "resnet18" else 1
+def worth_sharing(network: DiffusionPolicy) -> bool:
+    """Whether its camera networks look at the same time, each on a core of its own: the paper's, which take a tick one
+    after the other. Others are too short to be handed to another thread, and so is a U-Net step."""
+    return network.config.encoder == "resnet18" and (os.cpu_count() or 1) > 1
 
 
 def unusable(network: DiffusionPolicy) -> str:

@@ -1,8 +1,10 @@
-"""The arranged U-Net (fast_unet) through OpenVINO: one denoising step, six times as fast on CPU.
+"""The arranged U-Net (fast_unet) and the DDIM chain around it through OpenVINO: one call for a chunk, on CPU.
 
-The graph is built from operations, without a converter, and compiled in a quarter of a second, for each policy version
+The graph is built from operations, without a converter, and compiled in a third of a second, for each policy version
 anew: its weights are the graph's constants, laid out once as the processor likes them. Given as inputs they would have
-to be laid out anew at every step, which then takes two to six times as long. Called by openvino_engine.
+to be laid out anew at every step, which then takes two to six times as long. The chain is a loop inside the graph:
+asked for step by step, a quarter of the time would go to and from Python, which would wait for the interpreter's lock
+in between. Called by openvino_engine.
 """
 
 from __future__ import annotations
@@ -14,9 +16,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
+from far_app.learning.diffusion import ddim_coefficients
+from far_app.learning.engines.arranged import ArrangedChain
+from far_app.learning.engines.protocol import Push
 from far_app.learning.fast_unet import FastUnet
 
 BATCHES = 8
@@ -28,31 +33,30 @@ def available() -> bool:
     return importlib.util.find_spec("openvino") is not None
 
 
-class OpenVinoUnet:
-    """A FastUnet's `condition` and `run`, the latter through OpenVINO for small batches. Not for several threads at
-    once; the weights are those that the FastUnet held when this was made."""
+class OpenVinoChain:
+    """far_app.learning.engines.stepwise.Chain of a FastUnet's present weights. Not for several threads at once."""
 
-    def __init__(self, fast: FastUnet, threads: int = 1) -> None:
-        self.fast, self.threads = fast, threads
-        self._films = fast.leaves[0].detach()
+    def __init__(self, fast: FastUnet, steps: int) -> None:
+        self._plain = ArrangedChain(fast, steps)
+        self._fast, self._steps = fast, steps
+        self._films = fast.leaves[0].detach().numpy()
         self._weights = [np.ascontiguousarray(m.detach().numpy()) for m in fast.leaves[2:]]
         self._requests = {1: self._request(1)}
 
     def condition(self, features: Float[Tensor, "S F"]) -> Float[Tensor, "S M"]:
-        return self.fast.condition(features)
+        return self._plain.condition(features)
 
-    def run(
-        self, noisy: Float[Tensor, "B H A"], k: Int[Tensor, "B"], condition: Float[Tensor, "B M"]
+    def sample(
+        self, noise: Float[Tensor, "B H A"], condition: Float[Tensor, "B M"], push: Push | None = None
     ) -> Float[Tensor, "B H A"]:
-        """ε_θ(a_k, s, k), the observation given by its `condition`."""
-        batch = len(noisy)
-        if batch > BATCHES:
-            return self.fast.run(noisy, k, condition)
+        batch = len(noise)
+        if batch > BATCHES or push is not None:
+            return self._plain.sample(noise, condition, push)
         if batch not in self._requests:
             self._requests[batch] = self._request(batch)
         request, inputs = self._requests[batch]
-        inputs[0][:] = noisy.numpy()
-        inputs[1][:] = (self._films[k] + condition).numpy()[:, None]
+        inputs[0][:] = noise.numpy()
+        inputs[1][:] = condition.numpy()[:, None]
         request.infer()
         return torch.from_numpy(request.get_output_tensor(0).data.copy())
 
@@ -60,9 +64,9 @@ class OpenVinoUnet:
         """An inference request for this batch, and the inputs it reads."""
         from openvino import Tensor as Shared
 
-        chunk = (batch, self.fast.horizon, self._weights[-1].shape[0])
-        graph = _Builder(self.fast.unet, chunk, self._films.shape[1], self._weights).model()
-        request = core().compile_model(graph, "CPU", settings("f32", self.threads)).create_infer_request()
+        chunk = (batch, self._fast.horizon, self._weights[-1].shape[0])
+        graph = _chain(self._fast.unet, chunk, self._films, self._weights, self._steps)
+        request = core().compile_model(graph, "CPU", settings("f32")).create_infer_request()
         inputs = np.zeros(chunk, np.float32), np.zeros((batch, 1, self._films.shape[1]), np.float32)
         for i, array in enumerate(inputs):
             request.set_input_tensor(i, Shared(array, shared_memory=True))
@@ -76,11 +80,12 @@ def core() -> Any:
     return openvino.Core()
 
 
-def settings(precision: str, threads: int) -> dict[str, Any]:
-    """One inference as soon as possible, on so many threads; precision is "f32" or "bf16"."""
+def settings(precision: str) -> dict[str, Any]:
+    """One inference as soon as possible, on one thread; precision is "f32" or "bf16". Not pinned: OpenVINO would put
+    every inference on the first core, where it waits for whatever else runs there while another core is idle."""
     return {
-        "INFERENCE_NUM_THREADS": threads, "PERFORMANCE_HINT": "LATENCY", "INFERENCE_PRECISION_HINT": precision,
-        "NUM_STREAMS": 1,
+        "INFERENCE_NUM_THREADS": 1, "PERFORMANCE_HINT": "LATENCY", "INFERENCE_PRECISION_HINT": precision,
+        "NUM_STREAMS": 1, "ENABLE_CPU_PINNING": False,
     }  # fmt: skip
 
 
@@ -89,26 +94,51 @@ def by_tap(matrix: Float[np.ndarray, "O C3"]) -> Float[np.ndarray, "O 3C"]:
     return np.ascontiguousarray(matrix.reshape(len(matrix), -1, 3).swapaxes(1, 2)).reshape(len(matrix), -1)
 
 
-class _Builder:
-    """FastUnet.run, operation by operation."""
+def _chain(
+    unet: Any, chunk: tuple[int, int, int], films: Float[np.ndarray, "K M"], weights: Sequence[np.ndarray], steps: int
+) -> Any:
+    """far_app.learning.diffusion.ddim_sample as a graph: (noise (B, H, A), condition (B, 1, M)) → chunks. `films`: the
+    diffusion steps' part of FiLM."""
+    import openvino
+    from openvino import opset13
 
-    def __init__(self, unet: Any, chunk: tuple[int, int, int], film: int, weights: Sequence[np.ndarray]) -> None:
+    ops: Any = opset13
+    make: Any = openvino.Model
+    batch, film = chunk[0], films.shape[1]
+    noisy, here, condition, roots = (
+        ops.parameter(list(shape), np.float32) for shape in (chunk, (1, 1, film), (batch, 1, film), (1, 4))
+    )
+    epsilon = _Builder(unet, noisy, ops.add(here, condition), weights).graph()
+    root_a, root_na, root_b, root_nb = ops.split(roots, 1, 4).outputs()
+    clean = ops.clamp(ops.divide(ops.subtract(noisy, ops.multiply(root_na, epsilon)), root_a), -1.0, 1.0)
+    epsilon = ops.divide(ops.subtract(noisy, ops.multiply(root_a, clean)), root_na)
+    result = ops.result(ops.add(ops.multiply(root_b, clean), ops.multiply(root_nb, epsilon)))
+
+    noise, given = (ops.parameter(list(shape), np.float32) for shape in (chunk, (batch, 1, film)))
+    visited = ddim_coefficients(steps)
+    loop = ops.tensor_iterator()
+    loop.set_body(make([result], [noisy, here, condition, roots], "step"))
+    loop.set_merged_input(noisy, noise.output(0), result.output(0))
+    loop.set_invariant_input(condition, given.output(0))
+    each = [k for k, *_ in visited], [coefficients for _, *coefficients in visited]
+    for parameter, rows in ((here, films[each[0]][:, None]), (roots, np.array(each[1], np.float32))):
+        loop.set_sliced_input(parameter, ops.constant(rows).output(0), 0, 1, 1, -1, 0)
+    return make([ops.result(loop.get_iter_value(result.output(0), -1))], [noise, given], "chain")
+
+
+class _Builder:
+    """FastUnet.filmed, operation by operation."""
+
+    def __init__(self, unet: Any, noisy: Any, film: Any, weights: Sequence[np.ndarray]) -> None:
+        """`noisy`: (B, H, A), `film`: (B, 1, M), both of the graph."""
         from openvino import opset13
 
         self.ops: Any = opset13
-        self.unet = unet
-        self.noisy = self.ops.parameter(list(chunk), np.float32, name="noisy")
-        self.film = self.ops.parameter([chunk[0], 1, film], np.float32, name="film")
-        self.weights = weights
-        self.batch = chunk[0]
+        self.unet, self.noisy, self.film, self.weights = unet, noisy, film, weights
+        self.batch = int(noisy.get_output_shape(0)[0])
 
-    def model(self) -> Any:
-        import openvino
-
-        make: Any = openvino.Model
-        return make([self._graph()], [self.noisy, self.film], "denoiser")
-
-    def _graph(self) -> Any:
+    def graph(self) -> Any:
+        """ε_θ."""
         ops, u = self.ops, self.unet
         weights = iter(self.weights)
         blocks = [*(b for d in u.downs for b in d[:2]), *u.middle, *(b for d in u.ups for b in d[:2])]
