@@ -1,16 +1,20 @@
 """`far bench evaluate`: policy ticks a second of lockstep trials in one process, eight scenes side by side beside one
-after the other; and where the time goes.
+after the other, and where the time goes; then two processes at once beside one.
 
 Random weights: an attempt runs to its horizon. A machine runs as many such processes as it has cores (`far eval
---workers`), so the targets for two cores are asked of one process by half.
+--workers`), so the targets for two cores are asked of one process by half. For two at once this module starts itself as
+a process twice; each runs a round when it is told to.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
+import subprocess
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,12 +24,14 @@ import tyro
 
 from far_app.bench.report import write
 from far_app.bench.rows import Row, table
-from far_app.errors import ConfigError
+from far_app.errors import ConfigError, FarError
 from far_app.tasks import task as find_task
 from hw.rig import load_rig
 
 TARGETS = {"state": 75.0, "quickstart": 15.0}
 """Policy ticks a second of one process."""
+SCALING = 0.9
+"""Of twice one process's rate, what two at once should reach."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +44,8 @@ class EvaluateOptions:
     ticks: int = 40
     """Of each attempt."""
     rounds: int = 3
-    """Each round runs every scene once side by side and once one after the other."""
+    """Each round runs every scene once side by side and once one after the other; then once in one process and in
+    each of two."""
     json: Path | None = None
     """Write the report here."""
 
@@ -49,14 +56,11 @@ class EvaluateOptions:
 
 def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(EvaluateOptions, args=list(arguments), prog="far bench evaluate")
-    import torch
-
-    os.environ.setdefault("LP_NUM_THREADS", "1")
-    torch.set_num_threads(1)
+    one_thread()
     rows, shares = [], {}
     for preset in options.presets:
         row, shares[preset] = measure(preset, options)
-        rows.append(row)
+        rows += [row, scaling(preset, options)] if (os.cpu_count() or 1) > 1 else [row]
     write({"seconds_of_a_tick": shares, "rows": table(rows)}, options.json)
     return 0
 
@@ -98,42 +102,128 @@ class Forever:
         return lambda tick: np.zeros(self.policy.spec.action_dim)
 
 
-def measure(preset: str, options: EvaluateOptions) -> tuple[Row, dict[str, float]]:
-    from far_app.cli.assemble import untrained
-    from far_app.cli.lockstep_twin import LANES, lockstep_twins, trials
-    from far_app.learning.runtime import ActingPolicy
+class Lockstep:
+    """Lanes of a preset, warm."""
 
-    task = find_task(options.task, load_rig(options.rig).arm)
-    task = dataclasses.replace(task, horizon=options.ticks, max_attempts=1)
-    network, critic = untrained(preset, task.name, "cpu")
-    robots = lockstep_twins(options.rig, task, LANES, bool(network.config.cameras))
-    methods = [Forever(ActingPolicy(network, "bench", critic))] * LANES
-    list(trials(range(LANES), robots, methods, task))  # warm-up
-    watch = Stopwatch()
-    for robot in robots:
+    def __init__(self, preset: str, options: EvaluateOptions) -> None:
+        from far_app.cli.assemble import untrained
+        from far_app.cli.lockstep_twin import LANES, lockstep_twins
+        from far_app.learning.runtime import ActingPolicy
+
+        task = find_task(options.task, load_rig(options.rig).arm)
+        self.task = dataclasses.replace(task, horizon=options.ticks, max_attempts=1)
+        self.lanes = LANES
+        network, critic = untrained(preset, task.name, "cpu")
+        self.robots = lockstep_twins(options.rig, self.task, LANES, bool(network.config.cameras))
+        self.policy = ActingPolicy(network, "bench", critic)
+        self.round(0)
+
+    def round(self, number: int, lanes: int | None = None) -> tuple[int, float]:
+        """A round's scenes side by side, or in fewer lanes; (ticks, seconds)."""
+        from far_app.cli.lockstep_twin import trials
+
+        robots = self.robots[:lanes]
+        scenes = range(self.lanes * number, self.lanes * (number + 1))
+        began = time.perf_counter()
+        done = list(trials(scenes, robots, [Forever(self.policy)] * len(robots), self.task))
+        seconds = time.perf_counter() - began
+        return sum(len(a.steps) for _, t in done for a in t.attempts), seconds
+
+    def close(self) -> None:
+        for robot in self.robots:
+            if robot.view is not None:
+                robot.view.close()
+
+
+def measure(preset: str, options: EvaluateOptions) -> tuple[Row, dict[str, float]]:
+    lockstep, watch = Lockstep(preset, options), Stopwatch()
+    for robot in lockstep.robots:
         watch.around(robot.plant, "advance", "physics")
         watch.around(robot.controller, "tick", "controller")
-    if robots[0].view is not None:
-        watch.around(robots[0].view, "image", "drawing")
-    watch.around(methods[0].policy, "plan", "inference")
+    if lockstep.robots[0].view is not None:
+        watch.around(lockstep.robots[0].view, "image", "drawing")
+    watch.around(lockstep.policy, "plan", "inference")
     rates: dict[str, list[float]] = {"plain": [], "fast": []}
     parts: dict[str, float] = {}
-    for number in range(options.rounds):
-        scenes = range(LANES * (number + 1), LANES * (number + 2))
-        for form, lanes in (("fast", LANES), ("plain", 1)):
+    for number in range(1, options.rounds + 1):
+        for form, lanes in (("fast", None), ("plain", 1)):
             watch.seconds.clear()
-            began = time.perf_counter()
-            done = list(trials(scenes, robots[:lanes], methods[:lanes], task))
-            seconds = time.perf_counter() - began
-            ticks = sum(len(a.steps) for _, t in done for a in t.attempts)
+            ticks, seconds = lockstep.round(number, lanes)
             rates[form].append(ticks / seconds)
             if form == "fast":
                 parts = {k: round(s / ticks, 5) for k, s in (watch.seconds | {"all": seconds}).items()}
+    lockstep.close()
     row = Row(
-        what=f"{preset}, {LANES} scenes side by side against one at a time", unit="ticks/s", better="more",
+        what=f"{preset}, {lockstep.lanes} scenes side by side against one at a time", unit="ticks/s", better="more",
         fast=round(float(np.median(rates["fast"])), 1), plain=round(float(np.median(rates["plain"])), 1),
-        repeats=options.rounds * LANES * options.ticks, target=TARGETS.get(preset),
+        repeats=options.rounds * lockstep.lanes * options.ticks, target=TARGETS.get(preset),
     )  # fmt: skip
-    if robots[0].view is not None:
-        robots[0].view.close()
     return row, parts
+
+
+def scaling(preset: str, options: EvaluateOptions) -> Row:
+    """Two processes at once against one, starting left out."""
+    with contextlib.ExitStack() as stack:
+        children = [stack.enter_context(child(preset, options)) for _ in range(2)]
+        for each in children:
+            answer(each)  # it is warm
+        one, two, ticks = [], [], 0
+        for number in range(1, options.rounds + 1):
+            for rates, working in ((one, children[:1]), (two, children)):
+                began = time.perf_counter()
+                for each in working:
+                    print(number, file=each.stdin, flush=True)
+                done = sum(int(answer(each)) for each in working)
+                rates.append(done / (time.perf_counter() - began))
+                ticks += done
+    alone, both = float(np.median(one)), float(np.median(two))
+    return Row(
+        what=f"{preset}, two processes at once against one", unit="ticks/s", better="more", fast=round(both, 1),
+        plain=round(alone, 1), repeats=ticks, target=round(2 * SCALING * alone, 1),
+    )  # fmt: skip
+
+
+@contextlib.contextmanager
+def child(preset: str, options: EvaluateOptions) -> Iterator[subprocess.Popen[str]]:
+    """A process of this module; ends with the block."""
+    words = [sys.executable, "-m", "far_app.bench.evaluate", preset, options.task, options.rig, str(options.ticks)]
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        assert process.stdin is not None
+        process.stdin.close()
+        try:
+            process.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def answer(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    if not line:
+        raise FarError("a process of the benchmark ended early; its words are above")
+    return line
+
+
+def serve(preset: str, task: str, rig: str, ticks: str) -> None:
+    """The child: a round for each number that comes in, answered with its ticks."""
+    one_thread()
+    lockstep = Lockstep(preset, EvaluateOptions(task=task, rig=rig, ticks=int(ticks)))
+    print("ready", flush=True)
+    for line in sys.stdin:
+        print(lockstep.round(int(line))[0], flush=True)
+    lockstep.close()
+
+
+def one_thread() -> None:
+    import torch
+
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    torch.set_num_threads(1)
+
+
+if __name__ == "__main__":
+    serve(*sys.argv[1:])

@@ -1,6 +1,10 @@
 """Benchmarks of engines and adaptations compare like with like, in one run."""
 
+import pytest
+
 from far_app.bench import adapt, adapt_growth, infer
+from far_app.bench.evaluate import EvaluateOptions, scaling
+from far_app.cli.lockstep_twin import LANES
 from far_app.config import PairsConfig, RetryConfig
 from far_app.learning.engines import ENGINES
 from tests.learning.small import small_critic, small_policy
@@ -47,3 +51,11 @@ def test_an_attempt_of_noise_is_one_that_can_be_learnt_from():
     retry = RetryConfig(pairs=PairsConfig(candidates=16, d_max=100.0))
     _, stages = adapt_growth.adapted_in(network, small_critic(network), retry, attempt)
     assert {"attribution", "encoding", "candidates", "pairs", "update", "engine"} <= set(stages)
+
+
+@pytest.mark.slow
+def test_two_processes_of_lockstep_trials_run_as_many_ticks_each_as_one():
+    options = EvaluateOptions(rounds=1, ticks=2)
+    row = scaling("state", options)
+    assert row.repeats == 3 * LANES * options.ticks, "one alone, then two at once"
+    assert row.target is not None and row.plain and row.fast > 0
