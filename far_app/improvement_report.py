@@ -17,9 +17,8 @@ import numpy as np
 from far_app.errors import ConfigError
 from far_app.evaluation import read_results
 from far_app.improvement import Epoch, read_log
-from far_app.statistics import mcnemar, paired_difference, wilson
-
-BASELINE = "nr"
+from far_app.report import BASELINE, paired, rate
+from far_app.statistics import wilson
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +120,7 @@ def section(found: Sequence[Curve]) -> str:
         for epoch in curve.epochs:
             before = difference(curve.outcomes(epoch), curve.outcomes(0)) if epoch and 0 in curve.epochs else ""
             spent = " | ".join(f"{curve.mean(epoch, what):.0f}" for what in ("episodes", "timesteps"))
-            lines.append(f"| {curve.name} | {epoch} | {spent} | {rate(curve.outcomes(epoch))} | {before} |")
+            lines.append(f"| {curve.name} | {epoch} | {spent} | {rate([*curve.outcomes(epoch).values()])} | {before} |")
     for curve in found:
         for other in found:
             shared = set(curve.epochs) & set(other.epochs) - {0}
@@ -132,21 +131,13 @@ def section(found: Sequence[Curve]) -> str:
     return "\n".join(lines)
 
 
-def rate(outcomes: Mapping[tuple[int, int], bool]) -> str:
-    low, high = wilson(sum(outcomes.values()), len(outcomes))
-    return f"{100 * np.mean(list(outcomes.values())):.1f} [{100 * low:.1f}, {100 * high:.1f}]"
-
-
 def difference(ours: Mapping[tuple[int, int], bool], theirs: Mapping[tuple[int, int], bool]) -> str:
-    """In points, on the scenes of both, with the exact McNemar p."""
+    """On the scenes of both."""
     scenes = sorted(ours.keys() & theirs.keys())
     if not scenes:
         return "no scene in common"
-    a, b = [ours[s] for s in scenes], [theirs[s] for s in scenes]
-    mean, low, high = paired_difference(a, b)
-    p = mcnemar(sum(x > y for x, y in zip(a, b, strict=True)), sum(x < y for x, y in zip(a, b, strict=True)))
-    span = f" [{100 * low:+.1f}, {100 * high:+.1f}]" if len(scenes) > 1 else ""
-    return f"{100 * mean:+.1f}{span}, p = {p:.3g}"
+    points, p = paired([ours[s] for s in scenes], [theirs[s] for s in scenes])
+    return f"{points}, p = {p}"
 
 
 def draw(found: Sequence[Curve], target: Path) -> None:

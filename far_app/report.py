@@ -161,12 +161,17 @@ def rate(solved: Sequence[bool]) -> str:
 def against(results: Results, clusters: Sequence[Cluster], arm: str) -> list[str]:
     """Paired difference to the baseline, and its exact p."""
     ours, theirs = (together(results, clusters, a, results.max_attempts) for a in (arm, BASELINE))
+    return [*paired(ours, theirs)]
+
+
+def paired(ours: Sequence[bool], theirs: Sequence[bool]) -> tuple[str, str]:
+    """The difference on the same scenes, in points with its interval, and the exact McNemar p."""
     mean, low, high = paired_difference(ours, theirs)
     p = mcnemar(
         sum(a and not b for a, b in zip(ours, theirs, strict=True)),
         sum(b and not a for a, b in zip(ours, theirs, strict=True)),
     )
-    return [f"{100 * mean:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]", f"{p:.3g}"]
+    return f"{100 * mean:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]", f"{p:.3g}"
 
 
 def pooled(results: Results, arm: str, baseline: str | None) -> str:

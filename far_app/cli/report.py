@@ -72,11 +72,9 @@ def write_report(folders: Sequence[Path], target: Path) -> str:
     from far_app.report_plot import draw
 
     results = read_folders(folders)
-    text = markdown(results)
     target.mkdir(parents=True, exist_ok=True)
     draw(results, target / "success.png")
-    (target / "README.md").write_text(text + "\n![Success by attempt](success.png)\n")
-    return text
+    return written(markdown(results), "![Success by attempt](success.png)", target)
 
 
 def write_improvements(folders: Sequence[Path], target: Path) -> str:
@@ -84,8 +82,12 @@ def write_improvements(folders: Sequence[Path], target: Path) -> str:
     from far_app.improvement_report import curves, draw, markdown
 
     found = curves(folders)
-    text = markdown(found)
     target.mkdir(parents=True, exist_ok=True)
     draw(found, target / "improvement.png")
-    (target / "README.md").write_text(text + "\n![Success by episodes and ticks](improvement.png)\n")
+    return written(markdown(found), "![Success by episodes and ticks](improvement.png)", target)
+
+
+def written(text: str, picture: str, target: Path) -> str:
+    """The tables, to the folder's page with their picture below."""
+    (target / "README.md").write_text(f"{text}\n{picture}\n")
     return text

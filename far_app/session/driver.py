@@ -78,6 +78,7 @@ class Driver:
 
     def answer(self, event: Event) -> float | None:
         """What the trial's event asks of a driver in real time."""
+        share_interpreter()
         match event:
             case Tick():
                 return self._pass_tick(event)
@@ -94,7 +95,6 @@ class Driver:
     def _pass_tick(self, tick: Tick) -> float:
         """Bookkeeping of the last tick, then wait for this one's deadline and attend to what happened."""
         timeline = self.statistics.timeline
-        share_interpreter()
         self.planner.go()
         timeline.lap(AGGREGATE)
         if tick.step is not None and tick.step.tick == self.recorded:
@@ -107,7 +107,7 @@ class Driver:
         self.standing.show()
         timeline.lap(PUBLISH)
         due = self.clock.wait()
-        keep_interpreter()  # until the target is on its way, at the top of the next call
+        keep_interpreter()  # until the target is on its way: the trial's next event
         timeline.begin(self._tick - tick.between if tick.phase == "attempt" else -1, due)
         held = self.supervision.attend(tick.phase)
         if held and tick.phase == "attempt" and self.standing.state in IN_ATTEMPT:
