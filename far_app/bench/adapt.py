@@ -2,7 +2,8 @@
 
 First naive trials, until one has failed. Then a session in the twin as any other, whose short attempts all fail: while
 the arm goes home (and waits there) that one failure is learnt from again and again, in the session's background thread,
-in the fast form and in the plain one, which take turns. Then adaptations are cancelled at moments spread over their
+in the fast form and in the plain one, which take turns; each time with no more of its states encoded already than the
+policy had when the attempt ended. Then adaptations are cancelled at moments spread over their
 course. `homing` is what the naive trials needed to take the arm home: the time there is. `growth`
 (far_app/bench/adapt_growth.py) is measured without a loop.
 """
@@ -14,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
@@ -33,6 +34,9 @@ from far_app.session.inbox import IntentInbox
 from far_app.session.statistics import LoopStatistics, percentiles
 from far_app.session_states import Intent
 from far_app.types import Adaptation, Attempt
+
+if TYPE_CHECKING:
+    from far_app.methods.retry import RetryMethod
 
 ATTEMPTS, SHORT = 5, 20
 """Of a trial whose attempts all fail, and the ticks of one: the failure that is learnt from has its own."""
@@ -102,7 +106,7 @@ def measure(options: AdaptOptions) -> dict[str, Any]:
         with stage(run) as stage_:
             statistics, failure, _ = naive_session(stage_, options.attempt_seconds)
             inbox = IntentInbox()
-            forms = {"fast": stage_.parts.method, "plain": plainly(stage_.parts.another())}
+            forms = {"fast": learning(stage_.parts.method), "plain": plainly(learning(stage_.parts.another()))}
             taught = Taught(forms, failure, options, ended=lambda: inbox.put(Intent.QUIT))
             doomed = replace(stage_, task=replace(stage_.task, judge="person", horizon=SHORT))
             with doomed.session(doomed.writer(), inbox, LoopStatistics(), method=taught) as session:
@@ -125,7 +129,7 @@ class Taught:
     name = "far"
 
     def __init__(
-        self, forms: Mapping[str, Method], failure: Attempt, options: AdaptOptions, ended: Callable[[], None]
+        self, forms: Mapping[str, RetryMethod], failure: Attempt, options: AdaptOptions, ended: Callable[[], None]
     ) -> None:
         self.forms, self.failure, self.ended = forms, failure, ended
         self.turns = iter([*turns(options.rounds, options.plain_rounds), *["cancelled"] * options.cancels])
@@ -134,6 +138,7 @@ class Taught:
         self.late: list[float] = []
         """Seconds from each cancellation until it was heeded."""
         self.perturb = forms["fast"].perturb
+        self._seen = forms["fast"].memory.copy()
         self._cancelled = 0
 
     @property
@@ -150,6 +155,7 @@ class Taught:
             return unchanged(self.policy.version, "none")
         method = self.forms["plain" if turn == "plain" else "fast"]
         method.begin(attempt.scene_seed)
+        method.memory = self._seen.copy()
         began = time.monotonic()
         if turn == "cancelled":
             typical = float(np.median(self.measured["fast"].seconds))
@@ -172,11 +178,17 @@ def turns(fast: int, plain: int) -> list[str]:
     return [form for _, form in sorted(order)]
 
 
-def plainly(method: Method) -> Method:
-    """The same method, its denoiser run as it is written."""
-    from far_app.learning.trainable import plain
+def learning(method: Method) -> RetryMethod:
+    """The benchmark's method, which learns."""
     from far_app.methods.retry import RetryMethod
 
-    assert isinstance(method, RetryMethod), "the benchmark's method learns"
-    method.arrange = plain
+    assert isinstance(method, RetryMethod), "far is one"
+    return method
+
+
+def plainly(method: RetryMethod) -> RetryMethod:
+    """The same method, its networks run as they are written."""
+    from far_app.learning.trainable import plain
+
+    method.arrange, method.encode = plain, method.base.encode
     return method

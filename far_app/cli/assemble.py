@@ -161,7 +161,7 @@ def equip(model: Model, method: str, retry: RetryConfig) -> Parts:
         retry = with_threshold(retry, model.critic_file)
     ingredients = Ingredients(
         network=model.network, critic=model.critic, config=retry, demonstrations=demonstrations, act=model.act,
-        memory=model.memory,
+        memory=model.memory, encoder=model.base.another_encoder,
     )  # fmt: skip
     return Parts(
         method=make_method(method, ingredients), policy_name=model.name, max_attempts=entry.attempts,

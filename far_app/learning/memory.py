@@ -35,6 +35,13 @@ class FeatureMemory:
         )
         self._lock = threading.Lock()
 
+    def copy(self) -> FeatureMemory:
+        """Another one that knows the same so far."""
+        other = FeatureMemory(self._room)
+        with self._lock:
+            other._known.update(self._known)
+        return other
+
     def room_for(self, histories: int) -> None:
         """Keep at least so many."""
         self._room = max(self._room, histories)

@@ -16,7 +16,7 @@ from torch import Tensor
 from far_app.errors import PolicyError
 from far_app.learning.critic import Critic
 from far_app.learning.engines import Choice, order_of, take
-from far_app.learning.memory import FeatureMemory
+from far_app.learning.memory import Encode, FeatureMemory
 from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.steering import Steering, more_noise
 from far_app.protocols import EngineReport, History, PolicySpec
@@ -55,6 +55,10 @@ class ActingPolicy:
     def runs_on(self) -> EngineReport:
         """far_app.protocols.RunsOnEngine."""
         return self._taken.report
+
+    def another_encoder(self) -> Encode:
+        """How the policy sees, for another thread; the version does not matter, for the encoder is frozen."""
+        return self._taken.engine.another_encoder()
 
     def plan(
         self, histories: Sequence[History], ticks: Sequence[int], noise: Float[np.ndarray, "B H A"]

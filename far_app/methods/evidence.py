@@ -15,14 +15,14 @@ from far_app.config import AttributionConfig
 from far_app.learning.attribution import corrected, flag, value_change, without_person
 from far_app.learning.cancellation import Cancelled, check
 from far_app.learning.critic import Critic
-from far_app.learning.memory import FeatureMemory
+from far_app.learning.memory import Encode, FeatureMemory
 from far_app.learning.pairs import Pairs, distance
 from far_app.learning.policy import DiffusionPolicy
 from far_app.protocols import History
 from far_app.types import Adaptation, Attempt, Contrast
 
-HISTORIES_A_PASS = 1
-"""Histories encoded between two looks at `cancelled`: some 70 ms of one core for the paper's ResNets."""
+HISTORIES_A_PASS = {"cpu": 1, "cuda": 16}
+"""Histories encoded between two looks at `cancelled`, by device: on a CPU up to 70 ms for the paper's ResNets."""
 
 
 def history(attempt: Attempt, tick: int, n_obs: int) -> History:
@@ -38,33 +38,38 @@ class Eyes:
     policy: DiffusionPolicy
     critic: Critic
     memory: FeatureMemory
+    encode: Encode | None = None
+    """The policy's encoder where there is a faster form of it than its own."""
 
     def own(self, attempt: Attempt, ticks: Sequence[int], cancelled: Cancelled) -> Float[Tensor, "S F"]:
         """The policy's features of s_t for these ticks."""
-        return self._look(self.policy, "policy", attempt, ticks, cancelled)
+        return self._look(self.policy, self.encode or self.policy.encode, "policy", attempt, ticks, cancelled)
 
     def critics(self, attempt: Attempt, ticks: Sequence[int], cancelled: Cancelled) -> Float[Tensor, "S F"]:
         """What the critic takes of s_t for these ticks."""
         if self.critic.eyes is None:
             return self.own(attempt, ticks, cancelled)
-        return self._look(self.critic.eyes, "critic", attempt, ticks, cancelled)
+        return self._look(self.critic.eyes, self.critic.eyes.encode, "critic", attempt, ticks, cancelled)
 
     def _look(
-        self, network: DiffusionPolicy, eyes: str, attempt: Attempt, ticks: Sequence[int], cancelled: Cancelled
-    ) -> Float[Tensor, "S F"]:
+        self, network: DiffusionPolicy, encode: Encode, eyes: str, attempt: Attempt, ticks: Sequence[int],
+        cancelled: Cancelled,
+    ) -> Float[Tensor, "S F"]:  # fmt: skip
         """Those not seen before a few at a time."""
+        device = next(network.parameters()).device
+        a_pass = HISTORIES_A_PASS[device.type]
 
-        def encode(histories: Sequence[History]) -> Float[Tensor, "S F"]:
+        def look(histories: Sequence[History]) -> Float[Tensor, "S F"]:
             parts = []
-            for first in range(0, len(histories), HISTORIES_A_PASS):
+            for first in range(0, len(histories), a_pass):
                 check(cancelled)
-                parts.append(network.encode(histories[first : first + HISTORIES_A_PASS]))
+                parts.append(encode(histories[first : first + a_pass]))
             return torch.cat(parts)
 
         check(cancelled)
         if not len(ticks):
-            return torch.zeros(0, network.feature_dim, device=next(network.parameters()).device)
-        return self.memory.of([history(attempt, t, network.config.n_obs) for t in ticks], encode, eyes)
+            return torch.zeros(0, network.feature_dim, device=device)
+        return self.memory.of([history(attempt, t, network.config.n_obs) for t in ticks], look, eyes)
 
 
 def recorded_values(attempt: Attempt) -> Float[np.ndarray, "T+1"]:

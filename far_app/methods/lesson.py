@@ -19,7 +19,7 @@ from far_app.errors import FarError
 from far_app.learning import diffusion, fcpa
 from far_app.learning.cancellation import Cancelled, check
 from far_app.learning.critic import Critic
-from far_app.learning.memory import FeatureMemory
+from far_app.learning.memory import Encode, FeatureMemory
 from far_app.learning.pairs import Pairs, candidates, explored, merged, select, weighted_trajectory
 from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.preference import Demonstrations, Noising
@@ -43,6 +43,8 @@ class Learner:
     critic: Critic
     config: RetryConfig
     memory: FeatureMemory
+    encode: Encode
+    """How the policy sees."""
     demonstrations: Demonstrations | None
     arrange: Arrange
     rounds: Sequence[Pairs]
@@ -70,7 +72,7 @@ class Lesson:
     def attribute(self, progress: Progress) -> evidence.Eyes:
         """Find the chunks to blame; returns the eyes that did."""
         learner = self.learner
-        eyes = evidence.Eyes(policy=learner.base, critic=learner.critic, memory=learner.memory)
+        eyes = evidence.Eyes(policy=learner.base, critic=learner.critic, memory=learner.memory, encode=learner.encode)
         self.adaptation = evidence.attributed(
             self.adaptation, self.attempt, eyes, learner.config.attribution, self.cancelled
         )

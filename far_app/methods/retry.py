@@ -7,7 +7,9 @@ once, to a new version. The base network is never written to, so the base policy
 from __future__ import annotations
 
 import copy
+import functools
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -19,7 +21,7 @@ from far_app.learning import fcpa
 from far_app.learning.adapted import denoiser_of
 from far_app.learning.cancellation import AdaptationCancelledError, Cancelled, abandonable, check
 from far_app.learning.critic import Critic
-from far_app.learning.memory import FeatureMemory
+from far_app.learning.memory import Encode, FeatureMemory
 from far_app.learning.pairs import Pairs
 from far_app.learning.policy import DiffusionPolicy, fingerprint
 from far_app.learning.preference import Demonstrations
@@ -54,6 +56,8 @@ class Ingredients:
     """The bc guard and the failure memory's radius need them."""
     memory: FeatureMemory = field(default_factory=FeatureMemory)
     """What the acting policies have seen; shared with them, so that nothing is encoded twice."""
+    encoder: Callable[[], Encode] | None = None
+    """Makes what learning sees with where nobody saw before: the policy's encoder in a faster form, for one thread."""
     arrange: Arrange = trainable
     """How the denoiser is run for candidates and the update; `plain` to compare with."""
 
@@ -70,6 +74,7 @@ class RetryMethod:
         """With which trials begin."""
         self.critic = ingredients.critic
         self.memory = ingredients.memory
+        self._encoder = ingredients.encoder
         self.arrange = ingredients.arrange
         self.config = ingredients.config
         self.demonstrations = ingredients.demonstrations
@@ -92,6 +97,11 @@ class RetryMethod:
         self._scene = 0
         self._trial = 0
         self._restore()
+
+    @functools.cached_property
+    def encode(self) -> Encode:
+        """How a lesson sees, made with the first one."""
+        return self._encoder() if self._encoder is not None else self._first.encode
 
     def begin(self, scene_seed: int) -> None:
         with self._swap:
@@ -143,8 +153,8 @@ class RetryMethod:
         assert self.critic is not None, "checked when the method was made"
         return Learner(
             spec=self.policy.spec, version=self.policy.version, acting=self.acting, base=self.base,
-            critic=self.critic, config=self.config, memory=self.memory, demonstrations=self.demonstrations,
-            arrange=self.arrange, rounds=self.rounds,
+            critic=self.critic, config=self.config, memory=self.memory, encode=self.encode,
+            demonstrations=self.demonstrations, arrange=self.arrange, rounds=self.rounds,
         )  # fmt: skip
 
     def _restore(self) -> None:

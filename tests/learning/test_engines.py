@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import logging
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -92,6 +93,25 @@ def test_the_cuda_program_run_eagerly_is_the_reference(encoder, dtype, tolerance
     other = moved(network)
     check(engine.adapted(other, "v2"), ReferenceEngine(other, "v2"), tolerance, denoiser_only=True)
     check(engine, reference, tolerance)
+    histories = probe(network, 5)[0]
+    assert torch.allclose(engine.another_encoder()(histories), engine.encode(histories), atol=1e-6)
+
+
+@pytest.mark.parametrize("encoder", ["light", "resnet18", "none"])
+@pytest.mark.parametrize("name", [n for n in ENGINES if n != "cuda-graph"])
+def test_learning_sees_what_the_policy_sees_while_it_acts(name, encoder):
+    network, entry = policy(encoder), ENGINES[name]
+    if why := entry.unusable(network):
+        pytest.skip(f"{name}: {why}")
+    engine, tolerance = entry.make(network, "v", False), max(entry.tolerance, 1e-6)
+    learners = engine.another_encoder()
+    seen, acted = probe(network, 12)[0], probe(network, 24)[0][12:]
+    noise = torch.zeros(1, 8, 7)
+    with ThreadPoolExecutor() as pool:
+        learnt = pool.submit(lambda: torch.cat([learners([h]) for h in seen]))
+        features = torch.cat([engine.plan([h], noise)[0] for h in acted])
+    assert torch.allclose(learnt.result(), network.encode(seen), atol=tolerance)
+    assert torch.allclose(features, network.encode(acted), atol=tolerance)
 
 
 @needs_cuda

@@ -10,6 +10,7 @@ import torch
 
 from far_app.learning.critic import Critic, eyes_of
 from far_app.learning.memory import FeatureMemory
+from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.runtime import ActingPolicy
 from far_app.methods import Ingredients, method
 from far_app.methods.evidence import history
@@ -75,6 +76,40 @@ def test_an_adapted_version_finds_what_the_base_has_seen():
     (chunk,) = m.policy.plan([history(attempt, 5, 2)], [5], np.zeros((1, 8, 7), np.float32))
     assert counter.pictures == before
     assert chunk.policy_version == "base+a1"
+
+
+def test_what_the_policy_never_saw_is_learnt_from_through_its_engine(monkeypatch):
+    """A policy that does not plan at every tick leaves states to attribution."""
+    network = small_policy()
+    critic, passes, made = small_critic(network), [], []
+    base = ActingPolicy(network, "base", critic, "arranged")
+
+    def encoder():
+        made.append(1)
+        return lambda histories: (passes.append(len(histories)), DiffusionPolicy.encode(network, histories))[1]
+
+    m = method("far", Ingredients(
+        network=network, critic=critic, config=QUICK, encoder=encoder,
+        act=lambda net, version, steering=None: (
+            base if version == "base" else ActingPolicy(net, version, critic, "arranged", base=base)
+        ),
+    ))  # fmt: skip
+    monkeypatch.setattr(network, "encode", lambda histories: pytest.fail("encoded as it is written"))
+    assert not made, "made before anything was to be learnt"
+    attempt = small_attempt(40, values=False)
+    assert np.isfinite(adapt(m, attempt).values).all()
+    assert (sum(passes), made) == (41, [1])
+
+
+def test_a_copy_knows_what_was_known_and_goes_its_own_way():
+    memory, rng = FeatureMemory(), np.random.default_rng(0)
+    first, second = [(observation(0, rng),)], [(observation(1, rng),)]
+    memory.keep(first, torch.ones(1, 1))
+    other = memory.copy()
+    other.keep(second, torch.zeros(1, 1))
+    assert other.known([*first, *second])
+    assert memory.known(first)
+    assert not memory.known(second)
 
 
 def test_a_candidate_batch_needs_no_encoder():

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from far_app.learning.diffusion import ddim_coefficients, ddim_sample
 from far_app.learning.engines.protocol import EngineError, Entry, Push
 from far_app.learning.fast_unet import FastUnet, fits
+from far_app.learning.memory import Encode
 from far_app.learning.policy import DiffusionPolicy
 from far_app.protocols import History
 
@@ -114,12 +115,9 @@ class CudaGraphEngine:
         batch = len(histories)
         if batch not in self._whole:
             self._whole[batch] = self._whole_buffers(batch)
-        buffers, config = self._whole[batch], self.network.config
-        for camera in config.cameras:
-            buffers.put(
-                camera, torch.from_numpy(np.stack([np.stack([o.images[camera] for o in h]) for h in histories]))
-            )
-        buffers.put("states", self.network.states(histories))
+        buffers = self._whole[batch]
+        for name, value in self._seen(histories).items():
+            buffers.put(name, value)
         buffers.put("noise", noise)
         features, chunks = buffers.program()
         return features.clone(), chunks.clone()
@@ -145,6 +143,10 @@ class CudaGraphEngine:
         noise = torch.zeros(len(histories), config.horizon, self.network.spec().action_dim, device=self.device)
         return self.plan(histories, noise)[0]
 
+    def another_encoder(self) -> Encode:
+        """Launched kernel by kernel: an attempt's states come in batches of any size, and each would be captured."""
+        return self._eagerly_encoded
+
     def adapted(self, network: DiffusionPolicy, version: str) -> CudaGraphEngine:
         """Its graphs are captured when they are first asked for: by the check that follows."""
         return CudaGraphEngine(network, version, cameras=self._cameras)
@@ -157,11 +159,30 @@ class CudaGraphEngine:
         shapes["noise"] = ((batch, spec.horizon, spec.action_dim), torch.float32)
 
         def compute(inputs: dict[str, Tensor]) -> tuple[Tensor, ...]:
-            frames = [[self._cameras(c, t, inputs[c][:, t]) for c in network.config.cameras] for t in range(n_obs)]
-            features = network.encoder.join(frames, network.normalizer(inputs["states"]))
+            features = self._features(inputs)
             return features, self._denoised(features, inputs["noise"])
 
         return Buffers(shapes, compute, self.device)
+
+    @torch.no_grad()
+    def _eagerly_encoded(self, histories: Sequence[History]) -> Float[Tensor, "B F"]:
+        return self._features({name: value.to(self.device) for name, value in self._seen(histories).items()})
+
+    def _seen(self, histories: Sequence[History]) -> dict[str, Tensor]:
+        """Each camera's pictures (B, T, S, S, 3) uint8, and the states (B, T, D)."""
+        pictures = {
+            c: torch.from_numpy(np.stack([np.stack([o.images[c] for o in h]) for h in histories]))
+            for c in self.network.config.cameras
+        }
+        return {**pictures, "states": self.network.states(histories)}
+
+    def _features(self, inputs: dict[str, Tensor]) -> Float[Tensor, "B F"]:
+        """Of what `_seen` gives, on the device."""
+        network = self.network
+        frames = [
+            [self._cameras(c, t, inputs[c][:, t]) for c in network.config.cameras] for t in range(network.config.n_obs)
+        ]
+        return network.encoder.join(frames, network.normalizer(inputs["states"]))
 
     def _denoise_buffers(self, batch: int) -> Buffers:
         spec = self.network.spec()

@@ -7,7 +7,7 @@ OpenVINO 2026.4's own GroupNormalization takes the process down when a residual 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,18 +21,31 @@ from far_app.learning.engines.openvino_unet import core, settings
 from far_app.learning.engines.stepwise import Look
 
 
-class OpenVinoCameras:
-    """far_app.learning.engines.stepwise.CameraFeatures through OpenVINO. Not for several threads at once."""
+class CompiledCameras:
+    """An encoder's camera networks, ready for any number of threads, each with an OpenVinoCameras of its own."""
 
-    def __init__(self, encoder: ObservationEncoder, image_size: int, precision: str, together: bool = False) -> None:
-        """`together`: all looks at once, a core each: quicker than one after the other, each on all cores."""
-        self._together = together
-        self._requests = {
-            (camera, place): _request(net, image_size, precision)
+    def __init__(self, encoder: ObservationEncoder, image_size: int, precision: str) -> None:
+        self._size, self._shared = image_size, not encoder.per_frame
+        self._compiled: dict[tuple[str, int], Any] = {
+            (camera, place): core().compile_model(camera_graph(net, image_size), "CPU", settings(precision))
             for camera in encoder.camera_names
             for place, net in enumerate(encoder.networks(camera))
         }
-        self._shared = not encoder.per_frame
+
+    def looking(self, together: bool = False) -> OpenVinoCameras:
+        """`together`: all looks at once, a core each: quicker than one after the other."""
+        requests = {key: _request(compiled, self._size) for key, compiled in self._compiled.items()}
+        return OpenVinoCameras(requests, self._shared, together)
+
+
+class OpenVinoCameras:
+    """far_app.learning.engines.stepwise.CameraFeatures through OpenVINO. Not for several threads at once."""
+
+    def __init__(
+        self, requests: Mapping[tuple[str, int], tuple[Any, np.ndarray]], shared: bool, together: bool
+    ) -> None:  # fmt: skip
+        """`requests` by camera and place in the history; `shared`: every place has the first one's network."""
+        self._requests, self._shared, self._together = requests, shared, together
 
     def __call__(self, looks: Sequence[Look]) -> list[Float[Tensor, "B D"]]:
         requests = [self._requests[camera, 0 if self._shared else place] for camera, place, _ in looks]
@@ -51,11 +64,10 @@ class OpenVinoCameras:
         return [torch.from_numpy(np.concatenate(look)) for look in zip(*rows, strict=True)]
 
 
-def _request(net: nn.Module, size: int, precision: str) -> tuple[Any, np.ndarray]:
+def _request(compiled: Any, size: int) -> tuple[Any, np.ndarray]:
     """An inference request and the picture it reads."""
     import openvino
 
-    compiled = core().compile_model(camera_graph(net, size), "CPU", settings(precision))
     request = compiled.create_infer_request()
     pixels = np.zeros((1, size, size, 3), np.uint8)
     request.set_input_tensor(0, openvino.Tensor(pixels, shared_memory=True))

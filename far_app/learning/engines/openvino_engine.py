@@ -10,7 +10,7 @@ import os
 from functools import partial
 
 from far_app.learning.engines.arranged import unusable as unarranged
-from far_app.learning.engines.openvino_encoder import OpenVinoCameras
+from far_app.learning.engines.openvino_encoder import CompiledCameras
 from far_app.learning.engines.openvino_unet import OpenVinoChain, available
 from far_app.learning.engines.protocol import EngineError, Entry
 from far_app.learning.engines.stepwise import Frames, StepwiseEngine
@@ -29,8 +29,9 @@ def make(
 
     try:
         together = worth_sharing(network) and not each_alone
-        cameras = OpenVinoCameras(network.encoder, network.config.image_size, precision, together)
-        return StepwiseEngine(name, network, version, Frames(network, cameras, each_alone), chain)
+        cameras = CompiledCameras(network.encoder, network.config.image_size, precision)
+        frames = Frames(network, cameras.looking(together), each_alone, another=cameras.looking)
+        return StepwiseEngine(name, network, version, frames, chain)
     except (ImportError, RuntimeError) as error:
         raise EngineError(f"OpenVINO could not build it: {error}") from error
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from far_app.errors import FarError
+from far_app.learning.memory import Encode
 from far_app.learning.policy import DiffusionPolicy
 from far_app.protocols import History
 
@@ -31,6 +32,10 @@ class Engine(Protocol):
 
     def encode(self, histories: Sequence[History]) -> Float[Tensor, "B F"]:
         """Features of observation histories, oldest first."""
+        ...
+
+    def another_encoder(self) -> Encode:
+        """`encode` for another thread, while this engine goes on."""
         ...
 
     def sample(

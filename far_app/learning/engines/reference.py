@@ -10,6 +10,7 @@ from torch import Tensor
 
 from far_app.learning.diffusion import ddim_sample
 from far_app.learning.engines.protocol import Entry, Push
+from far_app.learning.memory import Encode
 from far_app.learning.policy import DiffusionPolicy
 from far_app.protocols import History
 
@@ -26,6 +27,9 @@ class ReferenceEngine:
         if self.each_alone:
             return torch.cat([self.network.encode([h]) for h in histories])
         return self.network.encode(histories)
+
+    def another_encoder(self) -> Encode:
+        return self.encode
 
     @torch.no_grad()
     def sample(

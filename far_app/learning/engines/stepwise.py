@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from far_app.learning.engines.protocol import Push
-from far_app.learning.memory import FeatureMemory
+from far_app.learning.memory import Encode, FeatureMemory
 from far_app.learning.policy import DiffusionPolicy
 from far_app.protocols import History
 from far_app.types import Observation
@@ -49,8 +49,13 @@ class Chain(Protocol):
 class Frames:
     """Features of histories from a function for pictures."""
 
-    def __init__(self, network: DiffusionPolicy, camera_features: CameraFeatures, each_alone: bool) -> None:
+    def __init__(
+        self, network: DiffusionPolicy, camera_features: CameraFeatures, each_alone: bool,
+        another: Callable[[], CameraFeatures] | None = None,
+    ) -> None:  # fmt: skip
+        """`another`: the same function for another thread; itself where it is for any number of them."""
         self.network, self.camera_features, self.each_alone = network, camera_features, each_alone
+        self._another = another or (lambda: camera_features)
         self._kept = FeatureMemory(KEPT_FRAMES)
 
     def features(self, histories: Sequence[History]) -> Float[Tensor, "B F"]:
@@ -68,6 +73,10 @@ class Frames:
             seen = known.split(len(histories))
         each = [list(s.split(network.encoder.frame_dim, dim=1)) for s in seen]
         return network.encoder.join(each, state)
+
+    def another(self) -> Frames:
+        """The same for another thread."""
+        return Frames(self.network, self._another(), self.each_alone)
 
     def _cameras(self, observations: Sequence[Sequence[Observation]]) -> list[Float[Tensor, "B C*D"]]:
         """All cameras' features, side by side, of the observations at each place in the history."""
@@ -99,6 +108,9 @@ class StepwiseEngine:
     @torch.no_grad()
     def encode(self, histories: Sequence[History]) -> Float[Tensor, "B F"]:
         return self.frames.features(histories)
+
+    def another_encoder(self) -> Encode:
+        return torch.no_grad()(self.frames.another().features)
 
     @torch.no_grad()
     def sample(
