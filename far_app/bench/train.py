@@ -50,6 +50,8 @@ def main(arguments: Sequence[str]) -> int:
     check_device(options.device)
     torch.set_num_threads(options.threads)
     found = {preset: measure(preset, options) for preset in options.presets}
+    if options.device == "cpu":  # a GPU's fast form is in bf16 already
+        found |= {f"{p}, bf16": measure(p, options, low=True) for p in options.presets if looks(p)}
     report = {
         "device": options.device, "threads": options.threads,
         "largest_loss_difference": {preset: apart for preset, (_, apart) in found.items()},
@@ -59,12 +61,20 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def measure(name: str, options: TrainOptions) -> tuple[Row, float]:
-    """The row, and how far the two curves of the loss ever were apart, relative to the loss."""
+def looks(name: str) -> bool:
+    """Whether a preset has cameras."""
+    from far_app.learning.policy import preset
+
+    return bool(preset(name, "lift").cameras)
+
+
+def measure(name: str, options: TrainOptions, low: bool = False) -> tuple[Row, float]:
+    """The row, and how far the two curves of the loss ever were apart, relative to the loss. `low`: the fast form has
+    its camera networks in bf16."""
     import torch
 
     from far_app.learning.policy import preset
-    from far_app.learning.policy_step import FastStep, PlainStep
+    from far_app.learning.policy_step import FastStep, LowStep, PlainStep
     from far_app.learning.segments import DemonstrationArrays
     from far_app.learning.train_policy import TRAININGS, begun
 
@@ -72,7 +82,8 @@ def measure(name: str, options: TrainOptions) -> tuple[Row, float]:
     arrays = DemonstrationArrays(
         episodes(config.cameras, config.image_size, len(config.objects)), config, training.shift
     )
-    losses: dict[type[PlainStep], list[float]] = {PlainStep: [], FastStep: []}
+    quick = LowStep if low else FastStep
+    losses: dict[type[PlainStep], list[float]] = {PlainStep: [], quick: []}
 
     def stepping(form: type[PlainStep]) -> Any:
         torch.manual_seed(0)
@@ -87,12 +98,13 @@ def measure(name: str, options: TrainOptions) -> tuple[Row, float]:
 
         return one
 
-    plain, fast = timed_side_by_side(stepping(PlainStep), stepping(FastStep), options.repeats)
-    apart = max(abs(a - b) / a for a, b in zip(losses[PlainStep], losses[FastStep], strict=True))
+    plain, fast = timed_side_by_side(stepping(PlainStep), stepping(quick), options.repeats)
+    apart = max(abs(a - b) / a for a, b in zip(losses[PlainStep], losses[quick], strict=True))
     per_second = [1e3 / float(np.median(ms)) for ms in (plain, fast)]
     row = Row(
-        what=f"{name}, batch {training.batch} × {training.draws}", unit="steps/s", plain=round(per_second[0], 2),
-        fast=round(per_second[1], 2), repeats=options.repeats, target=round(TARGET * per_second[0], 2), better="more",
+        what=f"{name}, batch {training.batch} × {training.draws}" + ", cameras in bf16" * low, unit="steps/s",
+        plain=round(per_second[0], 2), fast=round(per_second[1], 2), repeats=options.repeats,
+        target=round(TARGET * per_second[0], 2), better="more",
     )  # fmt: skip
     return row, float(f"{apart:.2g}")
 

@@ -40,6 +40,9 @@ class TrainPolicyOptions:
     device: str = "cpu"
     threads: int = 2
     """torch threads."""
+    bf16: bool = False
+    """Camera networks in bfloat16 on a CPU too: quicker where the processor multiplies it itself (AMX, AVX-512 BF16),
+    and no longer the same to the bit on every machine. A GPU always does so."""
     norm: Literal["group", "batch"] = "group"
     """Normalisation in the paper preset's ResNets."""
     imagenet: Path | None = None
@@ -55,6 +58,7 @@ def main(arguments: Sequence[str]) -> int:
     from far_app.learning.decoded import decoded_episodes
     from far_app.learning.imagenet import resnet18_weights
     from far_app.learning.policy import preset
+    from far_app.learning.policy_step import FastStep, LowStep
     from far_app.learning.train_policy import TRAININGS, train_policy
     from far_app.preflight import colours_of
     from far_app.tasks import task as find_task
@@ -90,6 +94,7 @@ def main(arguments: Sequence[str]) -> int:
         card["setup"] = setup
     if config.cameras:
         card["colours"] = {c: colours_of(np.concatenate([e.images[c][::8] for e in episodes])) for c in config.cameras}
-    path = train_policy(episodes, config, training, folder, options.device, card, weights)
+    form = LowStep if options.bf16 else FastStep
+    path = train_policy(episodes, config, training, folder, options.device, card, weights, form=form)
     log.info("wrote %s", path)
     return 0

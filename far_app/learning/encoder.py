@@ -25,8 +25,9 @@ class SpatialSoftmax(nn.Module):
         self.register_buffer("grid", torch.stack([xs.flatten(), ys.flatten()], dim=-1), persistent=False)
 
     def forward(self, maps: Float[Tensor, "B C H W"]) -> Float[Tensor, "B 2C"]:
-        weights = maps.flatten(2).softmax(dim=-1)
-        return (weights @ self.grid).flatten(1)
+        with torch.autocast(maps.device.type, enabled=False):  # places are found to a hundredth of a pixel
+            weights = maps.float().flatten(2).softmax(dim=-1)
+            return (weights @ self.grid).flatten(1)
 
 
 class LightCamera(nn.Module):

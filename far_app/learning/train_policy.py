@@ -89,23 +89,23 @@ def train_policy(
     imagenet: dict[str, Tensor] | None = None,
     start: DiffusionPolicy | None = None,
     weights: Float[np.ndarray, "N"] | None = None,
-    plain: bool = False,
+    form: type[PlainStep] = FastStep,
 ) -> Path:
     """Train (or go on training) in a folder; returns the checkpoint (EMA weights). log.jsonl: a line an interval.
 
     `start`: finetune this policy, its encoder and normaliser frozen, so that a critic on its features keeps its
     meaning. `weights`: of every tick of the episodes, side by side (paper, Eq. awr).
-    `plain`: by the readable form of a step (policy_step)."""
+    `form`: of a step (policy_step)."""
     torch.manual_seed(training.seed)
     rng = np.random.default_rng(training.seed)
     generator = torch.Generator().manual_seed(training.seed)
     on_cpu = torch.device(device).type == "cpu"
     arrays = (
         DemonstrationArrays(episodes, config, training.shift)
-        if on_cpu or plain
+        if on_cpu or form is PlainStep
         else DeviceDemonstrations(episodes, config, training.shift, device)
     )
-    step = begun(PlainStep if plain else FastStep, config, training, arrays, device, imagenet, start)
+    step = begun(form, config, training, arrays, device, imagenet, start)
     policy, ema, locator, optimizer = step.policy, step.ema, step.locator, step.optimizer
     state_path = folder / "state.safetensors"
     done = 0

@@ -10,7 +10,7 @@ import torch
 from far_app.errors import ConfigError, RecordingError
 from far_app.learning.dataset import Episode, check_origin, read_episodes, write_episode
 from far_app.learning.policy import fingerprint, load_policy, preset
-from far_app.learning.policy_step import FastStep, PlainStep
+from far_app.learning.policy_step import FastStep, LowStep, PlainStep
 from far_app.learning.segments import DemonstrationArrays
 from far_app.learning.train_policy import PolicyTraining, begun, learning_rate, train_policy
 from hw.camera_config import CameraConfig
@@ -123,10 +123,35 @@ def test_a_fast_step_is_the_plain_one(name):
     assert apart.mean() < 2e-5, "AdamW makes 1e-3 of the smallest gradient: a few weights may differ"
 
 
+def test_cameras_in_bf16_learn_the_same_within_its_rounding():
+    """The pictures show something, so that features are more than the mean of a grid."""
+    config = dataclasses.replace(preset("quickstart", "lift"), image_size=32, widths=(16, 32, 64))
+    training = dataclasses.replace(TRAINING, shift=2)
+    arrays = DemonstrationArrays(episodes(size=32), config, training.shift)
+    seen, losses = {}, {}
+    for form in (FastStep, LowStep):
+        torch.manual_seed(0)
+        step = begun(form, config, training, arrays)
+        for parameter in step.policy.encoder.parameters():
+            parameter.data.mul_(3.0)
+        rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
+        drawn = arrays.segments(2, 4, rng)
+        seen[form] = step._features(drawn.images, drawn.states)
+        losses[form] = []
+        for _ in range(5):
+            loss = step.loss(arrays.segments(2, 4, rng), generator, None)
+            step.update(loss, 1e-3, decay=0.5)
+            losses[form].append(loss.item())
+    apart = (seen[LowStep] - seen[FastStep]).abs()
+    assert 1e-5 < apart.max() < 0.05, "it rounds, and no more than that"
+    assert seen[LowStep].dtype == torch.float32
+    assert losses[LowStep] == pytest.approx(losses[FastStep], rel=0.02)
+
+
 def test_a_run_by_plain_steps_learns_the_same(tmp_path):
     logs = {}
     for plain in (True, False):
-        train_policy(episodes(), CONFIG, TRAINING, tmp_path / str(plain), plain=plain)
+        train_policy(episodes(), CONFIG, TRAINING, tmp_path / str(plain), form=PlainStep if plain else FastStep)
         lines = (tmp_path / str(plain) / "log.jsonl").read_text().splitlines()
         logs[plain] = [json.loads(line)["loss"] for line in lines]
     assert len(logs[True]) == 3 and logs[False] == pytest.approx(logs[True], rel=1e-3)
