@@ -22,7 +22,7 @@ from typing import Any
 import tyro
 
 from far_app.bench.report import write
-from far_app.cli.options import RunOptions
+from far_app.cli.options import EngineName, RunOptions
 from far_app.cli.settings import recommended
 from far_app.cli.stage import Stage, stage
 from far_app.errors import ConfigError, FarError
@@ -46,6 +46,8 @@ class LoopOptions:
     """Policy checkpoint; the shipped quickstart model by default."""
     critic: Path | None = None
     """Critic checkpoint; the one beside the policy by default."""
+    engine: EngineName = "auto"
+    """Runs the policy, as in `far run`."""
     seed: int = 0
     port: int = 0
     """The page's port; 0 takes a free one."""
@@ -69,6 +71,7 @@ def measure(options: LoopOptions) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="far-bench-") as recordings:
         run = RunOptions(
             seed=options.seed, policy=options.policy, critic=options.critic, port=options.port, method="far",
+            engine=options.engine,
             headless=not options.page, rerun=False, torch_threads=options.torch_threads, recordings=Path(recordings),
             retry=recommended(RunOptions.task, options.policy),
         )  # fmt: skip

@@ -11,6 +11,8 @@ from far_app.config import RetryConfig
 from far_app.errors import ConfigError
 from hw.rig import RigConfig, at_address, load_rig
 
+EngineName = Literal["auto", "torch", "arranged", "openvino", "openvino-bf16", "cuda-graph"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
@@ -47,7 +49,7 @@ class RunOptions:
     """Critic checkpoint; the one beside the policy by default."""
     device: str = "cpu"
     """cpu or cuda."""
-    engine: Literal["auto", "torch", "arranged", "openvino", "openvino-bf16", "cuda-graph"] = "auto"
+    engine: EngineName = "auto"
     """What runs the policy; auto takes the fastest of this machine (`far doctor` says which), torch is the
     reference."""
     max_attempts: int | None = None
