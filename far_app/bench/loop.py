@@ -2,7 +2,8 @@
 
 The twin at 30 Hz with recording, the page's process and one connected client (a raw WebSocket: a browser on the same
 cores would measure the browser). Lateness is that of a target's acceptance in the hw server; `floor` is a bare sleeper
-in a process of its own, all along.
+in a process of its own, all along, with a fixed piece of work at each wake-up: where that takes many times its median,
+the machine itself stalled.
 """
 
 from __future__ import annotations
@@ -179,10 +180,14 @@ def learning_all_along(method: Method, attempt: Attempt) -> Iterator[list[float]
         thread.join()
 
 
+Woken = tuple[float, float, float]
+"""A wake-up of the sleeper: deadline, lateness, and what a fixed piece of work took then; seconds."""
+
+
 @contextlib.contextmanager
-def floor(rate: float) -> Iterator[list[tuple[float, float]]]:
+def floor(rate: float) -> Iterator[list[Woken]]:
     """The sleeper, alongside; its wake-ups are there at the end."""
-    woken: list[tuple[float, float]] = []
+    woken: list[Woken] = []
     command = [sys.executable, "-m", "far_app.bench.floor", str(rate)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
@@ -190,7 +195,7 @@ def floor(rate: float) -> Iterator[list[tuple[float, float]]]:
     finally:
         process.terminate()
         output, _ = process.communicate(timeout=10)
-        woken += [(due, late) for due, late in json.loads(output or "[]")]
+        woken += [(due, late, work) for due, late, work in json.loads(output or "[]")]
 
 
 @contextlib.contextmanager
@@ -225,6 +230,7 @@ def _phase(statistics: LoopStatistics, threads: dict[str, float]) -> dict[str, A
     )
 
 
-def _floor(woken: list[tuple[float, float]], span: tuple[float, float]) -> dict[str, Any]:
-    late = [late for due, late in woken if span[0] <= due <= span[1]]
-    return {"ticks": len(late), "late_ms": percentiles(late, 1e3)}
+def _floor(woken: list[Woken], span: tuple[float, float]) -> dict[str, Any]:
+    inside = [(late, work) for due, late, work in woken if span[0] <= due <= span[1]]
+    late, work = [late for late, _ in inside], [work for _, work in inside]
+    return {"ticks": len(inside), "late_ms": percentiles(late, 1e3), "work_ms": percentiles(work, 1e3)}

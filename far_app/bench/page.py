@@ -114,7 +114,7 @@ def lateness(options: PageOptions) -> dict[str, Any]:
                 rounds.append(of_round)
     loop = {kind: percentiles(values, 1e3) for kind, values in late.items()}
     bare = {
-        kind: percentiles([lag for due, lag in woken if any(a <= due <= b for a, b in spans[kind])], 1e3)
+        kind: percentiles([lag for due, lag, _ in woken if any(a <= due <= b for a, b in spans[kind])], 1e3)
         for kind in spans
     }
     return {

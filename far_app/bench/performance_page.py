@@ -12,7 +12,8 @@ from far_app.types import TICK_STAGES
 
 TITLES = {
     "loop": "The tick", "render": "Drawing the twin", "infer": "A chunk", "adapt": "Learning from a failure",
-    "train": "Training", "evaluate": "Evaluation", "start": "Starting",
+    "adapt-paper": "Learning from a failure, the paper's network", "train": "Training", "evaluate": "Evaluation",
+    "start": "Starting",
 }  # fmt: skip
 
 
