@@ -158,7 +158,7 @@ class PerturbationConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ResamplingConfig:
-    """Retries that act otherwise without an update (bgr; beyond the paper rerank and negative-guidance)."""
+    """Retries that choose among samples (bgr; beyond the paper rerank, fcpa-rerank and negative-guidance)."""
 
     samples: int = 16
     """N, chunks drawn where a choice is made (paper, Baselines: 16 for DP-BGR)."""

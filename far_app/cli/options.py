@@ -27,7 +27,7 @@ class RunOptions:
     summary_json: Path | None = None
     """Write the summary here at the end."""
     method: str = "far"
-    """How to retry: dp, nr, perturb, fcpa, far, bgr, rerank, negative-guidance."""
+    """How to retry: dp, nr, perturb, fcpa, far, bgr, rerank, fcpa-rerank, negative-guidance."""
     task: str = "lift"
     """lift, stack, door, bread, can or square."""
     robot: Literal["twin", "xarm"] | None = None

@@ -1,6 +1,6 @@
 """Acting otherwise without other weights: which of several sampled chunks acts, or a push during denoising.
 
-Used by the methods that retry without an update (far_app/methods/{bgr,rerank,negative_guidance}.py).
+Used by far_app/methods/{bgr,rerank,negative_guidance}.py, which update nothing, and fcpa_rerank.py, which does.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from far_app.errors import ConfigError
 from far_app.methods.bgr import bgr
 from far_app.methods.far import far
 from far_app.methods.fcpa_only import fcpa_only
+from far_app.methods.fcpa_rerank import fcpa_rerank
 from far_app.methods.naive import naive, single
 from far_app.methods.negative_guidance import negative_guidance
 from far_app.methods.perturb import perturb
@@ -39,6 +40,11 @@ METHODS: dict[str, Entry] = {
         make=bgr, summary="retry with samples unlike what failed nearby", needs_critic=True, needs_demonstrations=True
     ),
     "rerank": Entry(make=rerank, summary="retry with the best of N samples by Q", needs_critic=True),
+    "fcpa-rerank": Entry(
+        make=fcpa_rerank,
+        summary="learn from the failure, then retry with the best of N samples by Q",
+        needs_critic=True,
+    ),
     "negative-guidance": Entry(
         make=negative_guidance,
         summary="retry with denoising pushed away from what failed nearby",

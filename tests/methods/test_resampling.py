@@ -1,4 +1,4 @@
-"""bgr, rerank and negative-guidance: same weights, other chunks, and only after a failure."""
+"""bgr, rerank and negative-guidance: same weights, other chunks, and only after a failure; fcpa-rerank: both."""
 
 import numpy as np
 import pytest
@@ -7,10 +7,12 @@ import torch
 from far_app.config import ResamplingConfig, RetryConfig
 from far_app.errors import ConfigError
 from far_app.learning.preference import Demonstrations
+from far_app.learning.steering import more_noise
 from far_app.methods import Ingredients, method
+from far_app.methods.evidence import history
 from far_app.methods.resampling import radius
 from tests.learning.small import small_attempt, small_critic, small_policy
-from tests.methods.test_methods import adapt, made, plan
+from tests.methods.test_methods import QUICK, adapt, made, plan
 
 
 def plans(m, tick: int) -> np.ndarray:
@@ -65,7 +67,28 @@ def test_without_demonstrations_there_is_no_measure_of_nearness(name):
         method(name, ingredients)
 
 
-def test_without_a_critic_it_says_so():
+@pytest.mark.parametrize("name", ["rerank", "fcpa-rerank"])
+def test_without_a_critic_it_says_so(name):
     network = small_policy()
     with pytest.raises(ConfigError, match="needs a critic"):
-        method("rerank", Ingredients(network=network, critic=None, act=lambda *a: None))
+        method(name, Ingredients(network=network, critic=None, act=lambda *a: None))
+
+
+def test_after_a_lesson_the_new_policys_best_sample_acts():
+    """fcpa-rerank: the weights are those that fcpa learns, the chunk is the one of N with the highest Q."""
+    m, plain = made("fcpa-rerank"), made("fcpa")
+    for learner in (m, plain):
+        learner.begin(5)
+        assert adapt(learner).status == "adapted"
+    assert m.policy.version == plain.policy.version == "base+a1"
+    history_, noise = history(small_attempt(), 3, 2), np.random.default_rng(1).standard_normal((1, 8, 7)).astype("f4")
+    (chunk,) = m.policy.plan([history_], [3], noise)
+    samples = torch.from_numpy(more_noise(noise[0], QUICK.resampling.samples))
+    features = plain.acting.encode([history_]).expand(len(samples), -1)
+    chunks = plain.acting.sample(features, samples)
+    best = int(small_critic(plain.acting).q(features, chunks).argmax())
+    assert np.allclose(chunk.actions, chunks[best].numpy(), atol=1e-5)
+    assert len(chunk.candidates) == QUICK.resampling.samples
+    m.begin(6)
+    (chunk,) = m.policy.plan([history_], [3], noise)
+    assert m.policy.version == "base" and chunk.candidates is None, "the first attempt is the base policy's"
