@@ -2,7 +2,8 @@
 
 Per task: success over its training seeds (mean ± standard deviation), Wilson's 95 % interval over episodes, the exact
 McNemar p against naive retry. Over tasks: the mean difference, with an interval from resampled (task, training seed)
-clusters, because episodes of one model are not independent of each other.
+clusters, because episodes of one model are not independent of each other, and from resampled scenes of each, because a
+task with a single model would otherwise count as known exactly.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from far_app.errors import ConfigError
 from far_app.evaluation import read_results
@@ -134,11 +136,11 @@ def task_section(results: Results, task: str) -> str:
 
 
 def pooled_section(results: Results) -> str:
-    """The mean over tasks, and its differences with intervals from resampled clusters."""
+    """The mean over tasks, and its differences with intervals from resampled clusters and scenes."""
     lines = [
         "## over tasks", "",
         f"Success within {results.max_attempts}, mean over tasks; differences in points with 95 % intervals from "
-        f"{RESAMPLES:,} resamples of (task, training seed) clusters.", "",
+        f"{RESAMPLES:,} resamples of (task, training seed) clusters and of each one's scenes.", "",
         f"| method | success | − {BASELINE} | − first attempt (dp) |", "|---|---|---|---|",
     ]  # fmt: skip
     for arm in results.arms:
@@ -176,18 +178,35 @@ def paired(ours: Sequence[bool], theirs: Sequence[bool]) -> tuple[str, str]:
 
 def pooled(results: Results, arm: str, baseline: str | None) -> str:
     """Mean over tasks of the paired difference to a baseline, or to the first attempt; clusters are resampled within
-    their tasks."""
-    by_task = []
+    their tasks, scenes within their clusters."""
+    by_task: list[list[Float[np.ndarray, "N"]]] = []
     for task in results.tasks:
-        means = []
+        differences = []
         for cluster in results.clusters(task):
             ours = results.solved(cluster, arm, results.max_attempts)
             theirs = results.solved(cluster, baseline or arm, results.max_attempts if baseline else 1)
-            means.append(np.mean([float(ours[s]) - float(theirs[s]) for s in ours]))
-        if means:
-            by_task.append(np.array(means))
+            differences.append(np.array([float(ours[s]) - float(theirs[s]) for s in ours]))
+        if differences:
+            by_task.append(differences)
     rng = np.random.default_rng(0)
-    draws = np.mean([m[rng.integers(0, len(m), (RESAMPLES, len(m)))].mean(1) for m in by_task], axis=0)
+    draws = np.mean([resampled(differences, rng) for differences in by_task], axis=0)
     low, high = np.percentile(draws, (2.5, 97.5))
-    mean = np.mean([m.mean() for m in by_task])
+    mean = np.mean([np.mean([d.mean() for d in differences]) for differences in by_task])
     return f"{100 * mean:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
+
+
+def resampled(clusters: Sequence[Float[np.ndarray, "N"]], rng: np.random.Generator) -> Float[np.ndarray, "R"]:
+    """Means of a task's differences, each from as many clusters drawn with replacement, and of each as many scenes."""
+    slots = (RESAMPLES, len(clusters))
+    means = np.stack([_redrawn(differences, rng, slots) for differences in clusters], axis=-1)
+    drawn = rng.integers(0, len(clusters), slots)
+    return np.take_along_axis(means, drawn[..., None], axis=-1)[..., 0].mean(axis=1)
+
+
+def _redrawn(
+    differences: Float[np.ndarray, "N"], rng: np.random.Generator, shape: tuple[int, ...]
+) -> Float[np.ndarray, "*S"]:
+    """The mean of N scenes drawn with replacement, so many times."""
+    values, counts = np.unique(differences, return_counts=True)
+    count = len(differences)
+    return rng.multinomial(count, counts / count, shape) @ values / count

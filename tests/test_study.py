@@ -99,7 +99,7 @@ def test_the_report_counts_episodes_seeds_and_pairs():
     assert "| nr | 50.0 [29.9, 70.1] | 50.0 [29.9, 70.1] | 50.0 ± 0.0 |" in text
     row = next(line for line in text.splitlines() if line.startswith("| far | 50.0"))
     assert "100.0 [83.9, 100.0]" in row and "+50.0" in row and "0.00195" in row
-    assert pooled(results(), "far", "nr") == "+50.0 [+50.0, +50.0]"
+    assert pooled(results(), "far", "nr") == "+50.0 [+35.0, +65.0]", "40 scenes, half of them won"
     assert "## over tasks" in text
 
 
@@ -125,6 +125,24 @@ def test_clusters_not_episodes_are_resampled():
     text = pooled(Results(arms=("nr", "far"), max_attempts=2, records=records), "far", "nr")
     low, high = (float(x) for x in text.split("[")[1].rstrip("]").split(","))
     assert high - low > 40, "seeds that differ so much leave the difference wide open, however many their episodes"
+
+
+def test_a_task_of_one_seed_is_no_surer_than_its_scenes_and_more_tasks_are():
+    rng = np.random.default_rng(0)
+
+    def one(task: str) -> dict:
+        nr, far = rng.random(50) < 0.6, rng.random(50) < 0.7
+        episodes = [episode(a, s, 2, bool(x)) for a, arm in (("nr", nr), ("far", far)) for s, x in enumerate(arm)]
+        return {(task, f"{task}-0"): episodes}
+
+    def width(records: dict) -> float:
+        text = pooled(Results(arms=("nr", "far"), max_attempts=2, records=records), "far", "nr")
+        low, high = (float(x) for x in text.split("[")[1].rstrip("]").split(","))
+        return high - low
+
+    lone = width(one("lift"))
+    assert 20 < lone < 45, "some 2 × 1.96 × √(0.45 / 50), in points"
+    assert width({k: v for task in ("lift", "can", "stack", "door") for k, v in one(task).items()}) < 0.7 * lone
 
 
 def written_results(folder: Path, whole: Results, arms: str = "nr far") -> None:
