@@ -3,9 +3,9 @@
 First naive trials, until one has failed. Then a session in the twin as any other, whose short attempts all fail: while
 the arm goes home (and waits there) that one failure is learnt from again and again, in the session's background thread,
 in the fast form and in the plain one, which take turns; each time with no more of its states encoded already than the
-policy had when the attempt ended. Then adaptations are cancelled at moments spread over their
-course. `homing` is what the naive trials needed to take the arm home: the time there is. `growth`
-(far_app/bench/adapt_growth.py) is measured without a loop.
+policy had when the attempt ended. Then adaptations are cancelled at moments spread over their course. `homing` is what
+the naive trials needed to take the arm home: the time there is. `growth` (far_app/bench/adapt_growth.py) is measured
+without a loop.
 """
 
 from __future__ import annotations
