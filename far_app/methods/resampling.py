@@ -39,10 +39,7 @@ class ResamplingMethod:
         self.network, self.critic, self.config = ingredients.network, ingredients.critic, ingredients.config
         self._act, self._remedy = ingredients.act, remedy(ingredients)
         self._eyes = evidence.Eyes(
-            policy=self.network,
-            critic=self.critic,
-            memory=ingredients.memory,
-            encode=ingredients.encoder() if ingredients.encoder is not None else None,
+            policy=self.network, critic=self.critic, memory=ingredients.memory, encode=ingredients.seeing()
         )
         self._swap = threading.Lock()
         self._base = self._act(self.network, BASE_VERSION)

@@ -61,6 +61,10 @@ class Ingredients:
     arrange: Arrange = trainable
     """How the denoiser is run for candidates and the update; `plain` to compare with."""
 
+    def seeing(self) -> Encode:
+        """How a lesson sees; for one thread."""
+        return self.encoder() if self.encoder is not None else self.network.encode
+
 
 class RetryMethod:
     """far_app.protocols.Method."""
@@ -74,7 +78,7 @@ class RetryMethod:
         """With which trials begin."""
         self.critic = ingredients.critic
         self.memory = ingredients.memory
-        self._encoder = ingredients.encoder
+        self._seeing = ingredients.seeing
         self.arrange = ingredients.arrange
         self.config = ingredients.config
         self.demonstrations = ingredients.demonstrations
@@ -101,7 +105,7 @@ class RetryMethod:
     @functools.cached_property
     def encode(self) -> Encode:
         """How a lesson sees, made with the first one."""
-        return self._encoder() if self._encoder is not None else self._first.encode
+        return self._seeing()
 
     def begin(self, scene_seed: int) -> None:
         with self._swap:
