@@ -61,6 +61,11 @@ def at_pace(entry: TaskConfig, arm: Arm) -> TaskConfig:
     return replace(entry, rate=XARM_HZ, horizon=round(seconds * XARM_HZ), repeat=1)
 
 
+def repeats(name: str, arm: str) -> int:
+    """Control steps for which a policy's action is repeated; 1 where the task is not one of these."""
+    return TASKS[name].repeat if name in TASKS and arm == "panda" else 1
+
+
 def supervised(entry: TaskConfig) -> TaskConfig:
     """A task on a real arm: at most three attempts, success judged by a person (paper, Real-world Experiments)."""
     return replace(entry, max_attempts=min(entry.max_attempts, 3), judge="person")

@@ -13,11 +13,31 @@ from typing import Any, Literal, TypeVar
 
 import tyro
 
-from far_app.cli.assemble import CHECKPOINTS, UNTRAINED, shipped
+from far_app.cli.assemble import UNTRAINED, shipped
 from far_app.config import RetryConfig, from_table
 from far_app.errors import ConfigError
 
 Settings = Literal["model", "paper"]
+STEP_SIZES = {"state": "1e-4", "quickstart": "3e-5"}
+"""fcpa.lr by preset."""
+EXPLORE = 0.15
+"""pairs.explore where an action is one control step; one that is repeated moves the hand that much farther."""
+MEASURED_BEST = """\
+# What measured best for the preset `{preset}` on development scenes (docs/results/README.md); all else is the paper's.
+[pairs]
+explore = {explore}        # candidates are moved by a translation each, and Q chooses among them
+d_min = 0.0           # positives may lie near the negative (the paper: the mean distance), …
+d_max = 100.0         # … or far from it (the paper: 1.0)
+
+[fcpa]
+lr = {lr}             # the paper: 1e-5
+guard = "bc"          # demonstrations hold the rest of the policy in place
+bc_weight = 0.1
+accumulate = false    # every retry starts from the base, with all of the trial's pairs
+
+[perturbation]
+first_attempt = 3     # the first retry acts as what was learnt says; later ones explore too (the paper: all retries)
+"""
 Options = TypeVar("Options")
 
 
@@ -35,13 +55,13 @@ def recommended(task: str, policy: str | Path | None) -> RetryConfig:
         raise ConfigError(f"{path} is not valid TOML: {error}") from error
 
 
-def recommend(task: str, preset: str, checkpoint: Path) -> Path | None:
-    """Put what measured best for such policies beside a new checkpoint; None where nothing is known of the task and
-    preset, or something lies there already."""
-    known, beside = CHECKPOINTS / f"{task}.{preset}.retry.toml", checkpoint.with_name("retry.toml")
-    if not known.exists() or beside.exists():
+def recommend(checkpoint: Path, preset: str, repeat: int = 1) -> Path | None:
+    """Put what measured best for such policies beside a new checkpoint; None where nothing is known of the preset, or
+    something lies there already. `repeat`: control steps for which an action is repeated."""
+    beside = checkpoint.with_name("retry.toml")
+    if preset not in STEP_SIZES or beside.exists():
         return None
-    beside.write_text(known.read_text())
+    beside.write_text(MEASURED_BEST.format(preset=preset, explore=round(EXPLORE / repeat, 3), lr=STEP_SIZES[preset]))
     return beside
 
 

@@ -48,8 +48,9 @@ def main(arguments: Sequence[str]) -> int:
 
     from far_app.cli.settings import recommend
     from far_app.learning.dataset import read_episodes
-    from far_app.learning.policy import load_policy, trained_framings
+    from far_app.learning.policy import load_policy, trained_framings, trained_setup
     from far_app.learning.train_critic import CriticTraining, train_critic
+    from far_app.tasks import repeats
 
     torch.set_num_threads(options.threads)
     path = options.policy or Path("runs") / f"{options.task}-quickstart" / "policy.safetensors"
@@ -66,6 +67,8 @@ def main(arguments: Sequence[str]) -> int:
     card: dict[str, object] = {"command": "far train critic " + " ".join(arguments)}
     checkpoint = train_critic(demonstrations, attempts, policy, training, options.out or path.parent, card)
     log.info("wrote %s", checkpoint)
-    if (settings := recommend(options.task, policy.config.preset, path)) is not None:
+    setup = trained_setup(path)
+    repeat = repeats(options.task, setup.arm) if setup is not None else 1
+    if (settings := recommend(path, policy.config.preset, repeat)) is not None:
         log.info("wrote %s: settings of retrying that measured best for such policies", settings)
     return 0

@@ -26,7 +26,7 @@ from far_app.learning.encoder import ObservationEncoder
 from far_app.learning.state import state_dim, state_of
 from far_app.learning.unet import ConditionalUnet1d
 from far_app.picture import Framing
-from far_app.preflight import setup_from
+from far_app.preflight import Setup, setup_from
 from far_app.protocols import OWN_STATE, History, PolicySpec
 from far_app.tasks import TASKS
 from far_app.types import ACTION_DIM
@@ -220,7 +220,12 @@ def read_card(path: Path) -> dict[str, object]:
         return added | json.loads((file.metadata() or {}).get("card", "{}"))
 
 
+def trained_setup(path: Path) -> Setup | None:
+    """What a policy's data were made on; None where its card does not say."""
+    return setup_from(read_card(path).get("setup"))
+
+
 def trained_framings(path: Path) -> dict[str, Framing]:
     """How the cameras of a policy's data were cut, by view; empty where its card does not say."""
-    setup = setup_from(read_card(path).get("setup"))
+    setup = trained_setup(path)
     return {name: view.framing for name, view in setup.views.items()} if setup is not None else {}

@@ -8,6 +8,7 @@ from far_app.cli.options import RunOptions
 from far_app.cli.settings import parse, recommend, recommended
 from far_app.config import FCPAConfig, RetryConfig
 from far_app.errors import ConfigError
+from far_app.tasks import repeats
 
 
 @pytest.fixture
@@ -44,15 +45,20 @@ def test_a_wrong_recommendation_is_named(tmp_path, text, says):
 @pytest.mark.parametrize("preset", ["state", "quickstart"])
 def test_a_new_checkpoint_gets_what_is_known_of_such_policies(tmp_path, preset):
     checkpoint = tmp_path / "policy.safetensors"
-    assert recommend("lift", preset, checkpoint) == tmp_path / "retry.toml"
-    assert recommended("lift", checkpoint).pairs.explore > 0
+    assert recommend(checkpoint, preset) == tmp_path / "retry.toml"
+    found = recommended("can", checkpoint)
+    assert (found.pairs.explore, found.fcpa.guard, found.perturbation.first_attempt) == (0.15, "bc", 3)
+
+
+def test_candidates_explore_by_as_many_millimetres_where_actions_are_repeated(tmp_path):
+    recommend(tmp_path / "policy.safetensors", "state", repeats("door", "panda"))
+    assert recommended("door", tmp_path / "policy.safetensors").pairs.explore == 0.05
 
 
 def test_a_recommendation_that_is_there_already_stays(checkpoint):
-    assert recommend("lift", "state", Path(checkpoint)) is None
+    assert recommend(Path(checkpoint), "state") is None
     assert recommended("lift", checkpoint).fcpa.lr == 2e-6
 
 
-@pytest.mark.parametrize(("task", "preset"), [("lift", "paper"), ("can", "state")])
-def test_nothing_is_recommended_where_nothing_measured_best(tmp_path, task, preset):
-    assert recommend(task, preset, tmp_path / "policy.safetensors") is None
+def test_nothing_is_recommended_where_nothing_measured_best(tmp_path):
+    assert recommend(tmp_path / "policy.safetensors", "paper") is None
