@@ -182,6 +182,7 @@ def test_what_fails_on_a_real_arm_is_learnt_from_and_retried_as_in_the_twin(fake
     command = [sys.executable, "-c", "import sys; from far_app.cli import main; sys.exit(main(sys.argv[1:]))", "run"]
     command += ["--rig", "rehearsal", "--host", f"{fake.address}:{FAKE_PORT}", "--accept-differences", "--headless"]
     command += ["--full-speed", "--trials", "1", "--max-attempts", "2", "--no-rerun", "--recordings", str(tmp_path)]
+    command += ["--retry.perturbation.first-attempt", "2"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200, check=False)
     assert done.returncode == 0, done.stderr
     first, second = read_session(find_session(tmp_path)).attempts()
