@@ -19,11 +19,12 @@ from far_app.errors import ConfigError
 
 Settings = Literal["model", "paper"]
 STEP_SIZES = {"state": "1e-4", "quickstart": "3e-5"}
-"""fcpa.lr by preset."""
+"""fcpa.lr by preset: `state` was measured on all six tasks, `quickstart` on `lift`."""
 EXPLORE = 0.15
 """pairs.explore where an action is one control step; one that is repeated moves the hand that much farther."""
 MEASURED_BEST = """\
-# What measured best for the preset `{preset}` on development scenes (docs/results/README.md); all else is the paper's.
+# What measured best for the preset `{preset}` (docs/results/README.md), chosen on development scenes but for the last
+# line; all else is the paper's.
 [pairs]
 explore = {explore}        # candidates are moved by a translation each, and Q chooses among them
 d_min = 0.0           # positives may lie near the negative (the paper: the mean distance), …

@@ -50,6 +50,11 @@ def test_a_new_checkpoint_gets_what_is_known_of_such_policies(tmp_path, preset):
     assert (found.pairs.explore, found.fcpa.guard, found.perturbation.first_attempt) == (0.15, "bc", 3)
 
 
+def test_the_shipped_model_has_what_a_new_one_would_get(tmp_path):
+    recommend(tmp_path / "policy.safetensors", "quickstart")
+    assert recommended("lift", None) == recommended("lift", tmp_path / "policy.safetensors")
+
+
 def test_candidates_explore_by_as_many_millimetres_where_actions_are_repeated(tmp_path):
     recommend(tmp_path / "policy.safetensors", "state", repeats("door", "panda"))
     assert recommended("door", tmp_path / "policy.safetensors").pairs.explore == 0.05
