@@ -40,6 +40,8 @@ STALE = 0.1
 """Age of the arm's own report, seconds, from which it is not led on."""
 LOST = 1.0
 """The same, from which it is a fault."""
+RESTED = 0.2
+"""Seconds the command must have stood still before the arm's report is where the arm will stay."""
 EPSILON = 1e-9
 
 
@@ -86,9 +88,7 @@ class ArmController:
             return self._refuse(target, now, "the arm is going home; targets are taken again when it is there")
         if self.measured.age > STALE:
             return self._refuse(target, now, f"the arm's last report is {1e3 * self.measured.age:.0f} ms old")
-        state = self._state
-        if self.mode is RobotMode.HOLD:
-            state = self._at_rest()
+        state = self._departure() if self.mode is RobotMode.HOLD else self._state
         began = self._stopwatch()
         verdict = safety_filter(state, target, self.rig.safety, now)
         took = self._stopwatch() - began
@@ -192,6 +192,8 @@ class ArmController:
         if measured.stalled:
             self._start_anew()
         verdict = safety_filter(self._state, command, self.rig.safety, now)
+        moving = verdict.state.velocity.any() or verdict.state.spin.any()
+        self._still = 0 if moving else self._still + 1
         self._state = verdict.state
         return verdict.pose, self._grip
 
@@ -209,7 +211,7 @@ class ArmController:
             return Brake()
         if self._silent:
             self._silent = False
-            self._anchor()
+            self._state = self._departure()
         self.reason = homing.waiting
         wish = homing.step(measured, self._state.pose, self.period)
         self._grip = homing.gripper
@@ -256,6 +258,14 @@ class ArmController:
 
     def _anchor(self) -> None:
         self._state = self._at_rest()
+        self._still = 0
+
+    def _departure(self) -> SafetyState:
+        """What motion after a hold starts from: the measured pose, or, where the arm is still coming to rest, what it
+        is coming to rest at, for its report then shows where it has been."""
+        if self._still * self.period < RESTED - EPSILON:
+            return replace(self._state, last_seq=self._last_seq)
+        return self._at_rest()
 
     def _start_anew(self) -> None:
         """The arm stands at the last command after a late tick: no speed is carried over, nothing is caught up."""
@@ -304,8 +314,10 @@ class ArmController:
         homing = Homing(self.rig, self.task, self.measured, self._grip)
         if homing.failed:
             raise RobotError(f"Home refused: {homing.failed}")
-        if self.mode in (RobotMode.HOLD, RobotMode.GUIDED):
+        if self.mode is RobotMode.GUIDED:
             self._anchor()
+        elif self.mode is RobotMode.HOLD:
+            self._state = self._departure()
         self._homing, self._at_home, self._silent, self._last_seq = homing, False, False, -1
         self.mode, self.reason, self._last_fresh = RobotMode.HOMING, homing.waiting, now
 

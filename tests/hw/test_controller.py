@@ -12,7 +12,7 @@ import pytest
 
 from far_app.config import TaskConfig
 from far_app.errors import RobotError
-from far_app.motion import quat_from_rotvec, quat_multiply
+from far_app.motion import quat_from_rotvec, quat_multiply, rotation_between
 from far_app.protocols import Heartbeat, Hold, Home, Resume
 from far_app.tasks import task
 from far_app.types import Pose, RobotMode, Target
@@ -149,6 +149,30 @@ def test_motion_after_a_hold_starts_from_the_measured_pose() -> None:
     assert not arm.target()
     arm.tick()
     assert math.dist(arm.commanded[-1].position, pushed) < RIG.safety.speed / arm.servo_hz + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_hold_makes_the_command_of_a_lagging_arm_jump(seed: int) -> None:
+    """Holds by silence, however short, on the way and on the way home, and requests in the midst of them."""
+    arm, rng = Arm(), np.random.default_rng(seed)
+    lag = int(rng.integers(1, 13))
+    for _ in range(60):
+        what = rng.integers(4)
+        if what == 0 and arm.mode is not RobotMode.HOMING:
+            arm.controller.request(Home(), arm.now)
+        elif what == 1:
+            arm.controller.request(Hold(reason="pause", latch=False), arm.now)
+        for _ in range(int(rng.integers(1, 12))):
+            arm.controller.request(Heartbeat(), arm.now)
+            arm.target(tuple(rng.normal(size=3) * 0.02), turn=0.05 * rng.normal())
+            for _ in range(int(rng.integers(1, 8) if rng.random() < 0.9 else rng.integers(8, 60))):
+                arm.tick()
+                arm.measured = replace(arm.measured, eef=arm.commanded[max(0, len(arm.commanded) - 1 - lag)])
+    change = np.diff([p.position for p in arm.commanded], n=2, axis=0) * arm.servo_hz**2
+    assert np.linalg.norm(change, axis=1).max() <= RIG.safety.acceleration * (1 + 1e-6)
+    spins = [rotation_between(a.quaternion, b.quaternion) for a, b in itertools.pairwise(arm.commanded)]
+    change = np.diff(spins, axis=0) * arm.servo_hz**2
+    assert np.linalg.norm(change, axis=1).max() <= RIG.safety.rotation_acceleration * (1 + 1e-3)
 
 
 def test_targets_never_pull_the_command_faster_than_the_limits() -> None:
