@@ -9,8 +9,9 @@ same draws for a state's negative and all its positives. Called by fcpa.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,39 +82,71 @@ def draw(
     return Draws(k=torch.from_numpy(k).to(like.device), noise=torch.from_numpy(noise).to(like.device))
 
 
-def denoising_errors(
-    denoiser: Trainable,
+@dataclass(frozen=True, kw_only=True)
+class Noisy:
+    """Noisy chunks, what was added to them, and the states they are denoised in."""
+
+    chunks: Float[Tensor, "R H A"]
+    k: Int[Tensor, "R"]
+    noise: Float[Tensor, "R H A"]
+    features: Float[Tensor, "S F"]
+    state: Int[Tensor, "R"]
+    """Row of `features` that each is denoised in."""
+
+    def __len__(self) -> int:
+        return len(self.chunks)
+
+
+def noised(
     noising: Noising,
     chunks: Float[Tensor, "N H A"],
     features: Float[Tensor, "S F"],
     draws: Draws,
     owner: Int[Tensor, "N"],
-    config: FCPAConfig,
-    cancelled: Cancelled,
-) -> list[Float[Tensor, "B"]]:
-    """Squared error, summed (or averaged) over entries (the arm's alone with `arm_only`), of every draw of every
-    chunk in its owner's state: N · D rows, a chunk's draws side by side, in batches. `per_chunk` makes l_diff of
-    them."""
+) -> Noisy:
+    """Every draw of every chunk in its owner's state: N · D rows, a chunk's draws side by side."""
     per_state = draws.k.shape[1]
-    state = owner.repeat_interleave(per_state)
     k, noise = draws.k[owner].flatten(), draws.noise[owner].flatten(0, 1)
-    noisy = noising.add_noise(chunks.repeat_interleave(per_state, dim=0), noise, k)
-    errors = []
-    dims = ARM_DIMS if config.arm_only else chunks.shape[2]
-    for rows in torch.arange(len(noisy)).split(BATCH):
+    return Noisy(
+        chunks=noising.add_noise(chunks.repeat_interleave(per_state, dim=0), noise, k), k=k, noise=noise,
+        features=features, state=owner.repeat_interleave(per_state),
+    )  # fmt: skip
+
+
+def joined(parts: Sequence[Noisy]) -> Noisy:
+    """All of them as one set."""
+    starts = itertools.accumulate((len(p.features) for p in parts[:-1]), initial=0)
+    return Noisy(
+        chunks=torch.cat([p.chunks for p in parts]), k=torch.cat([p.k for p in parts]),
+        noise=torch.cat([p.noise for p in parts]), features=torch.cat([p.features for p in parts]),
+        state=torch.cat([p.state + start for p, start in zip(parts, starts, strict=True)]),
+    )  # fmt: skip
+
+
+def denoising_errors(
+    denoiser: Trainable, noisy: Noisy, config: FCPAConfig, cancelled: Cancelled
+) -> list[Float[Tensor, "B"]]:
+    """‖ε − ε_θ‖² of every row, summed (or averaged) over entries (the arm's alone with `arm_only`), in batches as equal
+    as may be. `per_chunk` makes l_diff of them."""
+    errors: list[Tensor] = []
+    if not len(noisy):
+        return errors
+    dims = ARM_DIMS if config.arm_only else noisy.chunks.shape[2]
+    for rows in torch.arange(len(noisy)).tensor_split(math.ceil(len(noisy) / BATCH)):
         check(cancelled)
-        here, row = state[rows].unique(return_inverse=True)
-        predicted = denoiser.run(noisy[rows], k[rows], denoiser.condition(features[here]).index_select(0, row))
+        here, row = noisy.state[rows].unique(return_inverse=True)
+        condition = denoiser.condition(noisy.features[here]).index_select(0, row)
+        predicted = denoiser.run(noisy.chunks[rows], noisy.k[rows], condition)
         if predicted.requires_grad:
             predicted.register_hook(lambda _: check(cancelled))  # on the way back too, batch by batch
-        squared = (noise[rows] - predicted)[..., :dims].square().flatten(1)
+        squared = (noisy.noise[rows] - predicted)[..., :dims].square().flatten(1)
         errors.append(squared.sum(1) if config.reduction == "sum" else squared.mean(1))
     return errors
 
 
-def per_chunk(errors: list[Float[Tensor, "B"]], draws: int) -> Float[Tensor, "N"]:
-    """l_diff of each chunk: the mean over its draws, without gradients."""
-    return torch.cat([e.detach() for e in errors]).reshape(-1, draws).mean(1)
+def per_chunk(errors: Float[Tensor, "N*D"], draws: int) -> Float[Tensor, "N"]:
+    """l_diff of each chunk: the mean over its draws."""
+    return errors.reshape(-1, draws).mean(1)
 
 
 def preference_loss(
@@ -145,12 +178,12 @@ class Objective:
         self.denoiser, self.noising, self.pairs, self.config = denoiser, noising, pairs, config
         self.cancelled = cancelled
 
-    def errors(self, chunks: Tensor, owner: Tensor, states: slice, draws: Draws) -> list[Tensor]:
+    def noised(self, chunks: Tensor, owner: Tensor, states: slice, draws: Draws) -> Noisy:
         here = Draws(k=draws.k[states], noise=draws.noise[states])
-        return denoising_errors(
-            self.denoiser, self.noising, chunks, self.pairs.features[states], here, owner, self.config,
-            self.cancelled,
-        )  # fmt: skip
+        return noised(self.noising, chunks, self.pairs.features[states], here, owner)
+
+    def errors(self, noisy: Noisy) -> list[Tensor]:
+        return denoising_errors(self.denoiser, noisy, self.config, self.cancelled)
 
     @torch.no_grad()
     def report(self, draws: Draws) -> tuple[float, float, float]:
@@ -160,7 +193,8 @@ class Objective:
         if self.config.objective != "awr":
             chunks = torch.cat([chunks, pairs.negatives])
             owner = torch.cat([owner, torch.arange(len(pairs.negatives), device=owner.device)])
-        errors = per_chunk(self.errors(chunks, owner, slice(0, len(pairs.features)), draws), count)
+        noisy = self.noised(chunks, owner, slice(0, len(pairs.features)), draws)
+        errors = per_chunk(torch.cat(self.errors(noisy)), count)
         winner, loser = errors[: len(pairs)], torch.full_like(errors[: len(pairs)], math.nan)
         if self.config.objective != "awr":
             loser = errors[len(pairs) :][pairs.owner]
@@ -170,62 +204,72 @@ class Objective:
     def gradient(self, draws: Draws, cloning: Cloning | None = None) -> Float[Tensor, "P"]:
         """The loss's gradient, flat; with that of cloning added."""
         total = self.zeros()
-        self.gather(draws, total, total)
-        if cloning is not None:
-            self.gather_cloning(cloning, total)
+        cloned = [] if cloning is None else [(cloning.weight, self.cloned(cloning))]
+        for states, rows in blocks(self.pairs):
+            self.gather(states, rows, draws, [total], cloned)
+            cloned = []
         return self.denoiser.pull_back(total)
 
     def gradients(self, draws: Draws) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
         """(g⁺, g⁻): the loss's gradient through the positives' errors and through the negatives', flat; their sum is
         the gradient of the loss. Following −g⁺ lowers l⁺, following −g⁻ raises l⁻."""
-        at_winner, at_loser = self.zeros(), self.zeros()
-        self.gather(draws, at_winner, at_loser)
-        return self.denoiser.pull_back(at_winner), self.denoiser.pull_back(at_loser)
+        totals = [self.zeros(), self.zeros()]
+        for states, rows in blocks(self.pairs):
+            self.gather(states, rows, draws, totals, [])
+        at_winner, at_loser = (self.denoiser.pull_back(total) for total in totals)
+        return at_winner, at_loser
 
     def zeros(self) -> list[Tensor]:
         return [torch.zeros_like(leaf) for leaf in self.denoiser.leaves]
 
-    def gather(self, draws: Draws, at_winner: list[Tensor], at_loser: list[Tensor]) -> None:
-        """Add the loss's gradient on the denoiser's leaves: through l⁺ to one sum, through l⁻ to the other."""
-        count, objective = draws.k.shape[1], self.config.objective
-        for states, rows in blocks(self.pairs):
-            owner = self.pairs.owner[rows] - states.start
-            own = torch.arange(states.stop - states.start, device=owner.device)
-            winners, losers = [], []
-            winner = loser = torch.zeros(len(owner), device=owner.device)
-            if objective != "no_positive":
-                winners = self.errors(self.pairs.positives[rows], owner, states, draws)
-                winner = per_chunk(winners, count)
-            if objective in {"pairwise", "no_positive"}:
-                losers = self.errors(self.pairs.negatives[states], own, states, draws)
-                loser = per_chunk(losers, count)[owner]
-            at = winner.requires_grad_(), loser.clone().requires_grad_()
-            loss = preference_loss(*at, self.config, self.pairs.weights[rows]) / len(self.pairs)
-            to_winner, to_loser = torch.autograd.grad(loss, at, materialize_grads=True)
-            self.accumulate(at_winner, winners, to_winner, count)
-            self.accumulate(
-                at_loser, losers, torch.zeros_like(own, dtype=torch.float32).index_add_(0, owner, to_loser), count
-            )
+    def gather(
+        self, states: slice, rows: slice, draws: Draws, totals: Sequence[list[Tensor]],
+        cloned: Sequence[tuple[float, Noisy]],
+    ) -> None:  # fmt: skip
+        """Add the gradient of these states' part of the loss on the denoiser's leaves: to one sum in one go, or through
+        l⁺ to one and through l⁻ to another. With the mean error of `cloned`, times its weight, in the first."""
+        pairs, count, objective = self.pairs, draws.k.shape[1], self.config.objective
+        owner = pairs.owner[rows] - states.start
+        own = torch.arange(states.stop - states.start, device=owner.device)
+        wins, loses = objective != "no_positive", objective in {"pairwise", "no_positive"}
+        parts = [
+            self.noised(pairs.positives[rows][: wins * len(owner)], owner[: wins * len(owner)], states, draws),
+            self.noised(pairs.negatives[states][: loses * len(own)], own[: loses * len(own)], states, draws),
+            *(noisy for _, noisy in cloned),
+        ]  # fmt: skip
+        groups = [parts] if len(totals) == 1 else [[part] for part in parts]
+        errors = [self.errors(joined(group)) for group in groups]
+        found = torch.cat([e.detach() for batches in errors for e in batches]).split([len(p) for p in parts])
+        none = torch.zeros(len(owner), device=owner.device)
+        winner = (per_chunk(found[0], count) if wins else none).requires_grad_()
+        loser = (per_chunk(found[1], count)[owner] if loses else none.clone()).requires_grad_()
+        loss = preference_loss(winner, loser, self.config, pairs.weights[rows]) / len(pairs)
+        to_winner, to_loser = torch.autograd.grad(loss, (winner, loser), materialize_grads=True)
+        to_negative = torch.zeros(len(own), device=owner.device).index_add_(0, owner, to_loser)
+        shares = [
+            (to_winner / count).repeat_interleave(count)[: len(parts[0])],
+            (to_negative / count).repeat_interleave(count)[: len(parts[1])],
+            *(noisy.noise.new_full((len(noisy),), weight / len(noisy)) for weight, noisy in cloned),
+        ]  # fmt: skip
+        grouped = [torch.cat(shares)] if len(totals) == 1 else shares
+        for total, batches, share in zip(totals, errors, grouped, strict=True):
+            self.accumulate(total, batches, share)
 
-    def accumulate(self, totals: list[Tensor], errors: list[Tensor], share: Float[Tensor, "N"], draws: int) -> None:
-        """Add the gradients of Σ share · l_diff."""
+    def accumulate(self, total: list[Tensor], errors: list[Tensor], share: Float[Tensor, "R"]) -> None:
+        """Add the gradients of Σ share · error."""
         if not errors:
             return
         check(self.cancelled)
-        weights = (share / draws).repeat_interleave(draws).split([len(e) for e in errors])
+        weights = share.split([len(e) for e in errors])
         weighted = torch.stack([error @ weight for error, weight in zip(errors, weights, strict=True)]).sum()
         gradients = torch.autograd.grad(weighted, self.denoiser.leaves, materialize_grads=True)
-        for total, gradient in zip(totals, gradients, strict=True):
-            total.add_(gradient)
+        for sum_, gradient in zip(total, gradients, strict=True):
+            sum_.add_(gradient)
 
-    def gather_cloning(self, cloning: Cloning, total: list[Tensor]) -> None:
-        """Add the gradient of the weighted behaviour-cloning loss on a minibatch of demonstration chunks."""
+    def cloned(self, cloning: Cloning) -> Noisy:
+        """A minibatch of demonstration chunks."""
         demonstrations, rng = cloning.demonstrations, cloning.rng
         rows = torch.from_numpy(rng.integers(len(demonstrations.chunks), size=BC_BATCH))
         chunks = demonstrations.chunks[rows]
         draws = draw(rng, BC_BATCH, 1, self.noising.steps, chunks)
-        errors = denoising_errors(
-            self.denoiser, self.noising, chunks, demonstrations.features[rows], draws, torch.arange(BC_BATCH),
-            self.config, self.cancelled,
-        )  # fmt: skip
-        self.accumulate(total, errors, chunks.new_full((BC_BATCH,), cloning.weight / BC_BATCH), 1)
+        return noised(self.noising, chunks, demonstrations.features[rows], draws, torch.arange(BC_BATCH))
