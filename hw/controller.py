@@ -261,9 +261,9 @@ class ArmController:
         self._still = 0
 
     def _departure(self) -> SafetyState:
-        """What motion after a hold starts from: the measured pose, or, where the arm is still coming to rest, what it
-        is coming to rest at, for its report then shows where it has been."""
-        if self._still * self.period < RESTED - EPSILON:
+        """What motion after a hold starts from: the measured pose, or, where that was reported before the arm had come
+        to rest, what it is coming to rest at."""
+        if self._still * self.period - self.measured.age < RESTED - EPSILON:
             return replace(self._state, last_seq=self._last_seq)
         return self._at_rest()
 

@@ -153,7 +153,8 @@ def test_motion_after_a_hold_starts_from_the_measured_pose() -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_no_hold_makes_the_command_of_a_lagging_arm_jump(seed: int) -> None:
-    """Holds by silence, however short, on the way and on the way home, and requests in the midst of them."""
+    """Holds by silence, however short, on the way and on the way home, requests in the midst of them, and an arm whose
+    reports stop for a while."""
     arm, rng = Arm(), np.random.default_rng(seed)
     lag = int(rng.integers(1, 13))
     for _ in range(60):
@@ -162,12 +163,16 @@ def test_no_hold_makes_the_command_of_a_lagging_arm_jump(seed: int) -> None:
             arm.controller.request(Home(), arm.now)
         elif what == 1:
             arm.controller.request(Hold(reason="pause", latch=False), arm.now)
+        silent = rng.random() < 0.1
         for _ in range(int(rng.integers(1, 12))):
             arm.controller.request(Heartbeat(), arm.now)
             arm.target(tuple(rng.normal(size=3) * 0.02), turn=0.05 * rng.normal())
             for _ in range(int(rng.integers(1, 8) if rng.random() < 0.9 else rng.integers(8, 60))):
+                seen = arm.measured
                 arm.tick()
-                arm.measured = replace(arm.measured, eef=arm.commanded[max(0, len(arm.commanded) - 1 - lag)])
+                now = replace(arm.measured, eef=arm.commanded[max(0, len(arm.commanded) - 1 - lag)], age=0.0)
+                silent = silent and seen.age < 0.9
+                arm.measured = replace(seen, age=seen.age + 1 / arm.servo_hz) if silent else now
     change = np.diff([p.position for p in arm.commanded], n=2, axis=0) * arm.servo_hz**2
     assert np.linalg.norm(change, axis=1).max() <= RIG.safety.acceleration * (1 + 1e-6)
     spins = [rotation_between(a.quaternion, b.quaternion) for a, b in itertools.pairwise(arm.commanded)]
