@@ -178,9 +178,11 @@ class Objective:
         self.denoiser, self.noising, self.pairs, self.config = denoiser, noising, pairs, config
         self.cancelled = cancelled
 
-    def noised(self, chunks: Tensor, owner: Tensor, states: slice, draws: Draws) -> Noisy:
+    def noised(self, chunks: Tensor, owner: Tensor, states: slice, draws: Draws, asked: bool = True) -> Noisy:
+        """These chunks of these states; none of them unless the objective asks for them."""
         here = Draws(k=draws.k[states], noise=draws.noise[states])
-        return noised(self.noising, chunks, self.pairs.features[states], here, owner)
+        count = len(chunks) if asked else 0
+        return noised(self.noising, chunks[:count], self.pairs.features[states], here, owner[:count])
 
     def errors(self, noisy: Noisy) -> list[Tensor]:
         return denoising_errors(self.denoiser, noisy, self.config, self.cancelled)
@@ -233,11 +235,12 @@ class Objective:
         own = torch.arange(states.stop - states.start, device=owner.device)
         wins, loses = objective != "no_positive", objective in {"pairwise", "no_positive"}
         parts = [
-            self.noised(pairs.positives[rows][: wins * len(owner)], owner[: wins * len(owner)], states, draws),
-            self.noised(pairs.negatives[states][: loses * len(own)], own[: loses * len(own)], states, draws),
+            self.noised(pairs.positives[rows], owner, states, draws, asked=wins),
+            self.noised(pairs.negatives[states], own, states, draws, asked=loses),
             *(noisy for _, noisy in cloned),
         ]  # fmt: skip
-        groups = [parts] if len(totals) == 1 else [[part] for part in parts]
+        at_once = len(totals) == 1
+        groups = [parts] if at_once else [[part] for part in parts]
         errors = [self.errors(joined(group)) for group in groups]
         found = torch.cat([e.detach() for batches in errors for e in batches]).split([len(p) for p in parts])
         none = torch.zeros(len(owner), device=owner.device)
@@ -251,7 +254,7 @@ class Objective:
             (to_negative / count).repeat_interleave(count)[: len(parts[1])],
             *(noisy.noise.new_full((len(noisy),), weight / len(noisy)) for weight, noisy in cloned),
         ]  # fmt: skip
-        grouped = [torch.cat(shares)] if len(totals) == 1 else shares
+        grouped = [torch.cat(shares)] if at_once else shares
         for total, batches, share in zip(totals, errors, grouped, strict=True):
             self.accumulate(total, batches, share)
 
