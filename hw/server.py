@@ -21,7 +21,6 @@ import logging
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -47,6 +46,7 @@ from far_app.scheduling import (
 )
 from far_app.station import Station
 from far_app.tasks import task as task_named
+from far_app.told import Told
 from hw.camera_config import with_views
 from hw.camera_thread import CameraThread
 from hw.command_thread import CommandThread
@@ -148,7 +148,7 @@ class Ending:
 
     def __init__(self, parent: int | None) -> None:
         self._parent = parent
-        self._told = threading.Event()
+        self._told = Told()
         self._reasons: list[str] = []
         signal.signal(signal.SIGTERM, self._on_signal)
         signal.signal(signal.SIGINT, self._on_signal)

@@ -7,11 +7,11 @@ import logging
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from far_app.errors import FarError
+from far_app.told import Told
 
 log = logging.getLogger(__name__)
 
@@ -30,14 +30,12 @@ def die_with_parent(number: signal.Signals = signal.SIGTERM) -> Callable[[], boo
 
 
 def run_until_told(
-    parse: Callable[[Sequence[str] | None], Options], serve: Callable[[Options, threading.Event], None],
+    parse: Callable[[Sequence[str] | None], Options], serve: Callable[[Options, Told], None],
     arguments: Sequence[str] | None,
 ) -> int:  # fmt: skip
     """The main of such a process: `serve` what was parsed until SIGTERM or SIGINT; 2 on a FarError, said in the log."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
-    options, ended = parse(arguments), threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: ended.set())
+    options, ended = parse(arguments), Told().at(signal.SIGTERM, signal.SIGINT)
     try:
         serve(options, ended)
     except FarError as error:

@@ -11,7 +11,6 @@ import gc
 import logging
 import queue
 import sys
-import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +24,7 @@ from far_app.recording.said_lines import now
 from far_app.session_states import Intent
 from far_app.take_over import Nudge
 from far_app.telemetry import Telemetry
+from far_app.told import Told
 from ui.access import Access
 from ui.console import Console
 from ui.feeds import Feeds
@@ -183,7 +183,7 @@ def signed(said: Any, by: str) -> Any:
     return replace(said, by=by) if isinstance(said, Nudge | VersionWish) else said
 
 
-def serve(options: PageOptions, ended: threading.Event) -> None:
+def serve(options: PageOptions, ended: Told) -> None:
     """Run the page until `ended` is set or our parent is gone."""
     orphaned = die_with_parent()
     page = Page(options)

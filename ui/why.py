@@ -12,17 +12,17 @@ import json
 import logging
 import os
 import sys
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 
+from far_app.told import Told
 from ui.parent import die_with_parent, run_until_told
 from ui.why_view import View, WhyOptions
 
 log = logging.getLogger(__name__)
 
 
-def serve(options: WhyOptions, ended: threading.Event) -> None:
+def serve(options: WhyOptions, ended: Told) -> None:
     os.nice(5)  # beside a live run it gives way to the loop, the learning and the operator's page
     orphaned = die_with_parent()
     view = View(options)

@@ -6,9 +6,10 @@ import argparse
 import contextlib
 import getpass
 import signal
-import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+from far_app.told import Told
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -84,12 +85,11 @@ def _served(log: Path) -> str:
 
 
 @contextlib.contextmanager
-def _interrupts() -> Iterator[threading.Event]:
+def _interrupts() -> Iterator[Told]:
     """Ctrl-C and SIGTERM end it in order."""
-    ended = threading.Event()
-    before = {n: signal.signal(n, lambda *_: ended.set()) for n in (signal.SIGINT, signal.SIGTERM)}
+    before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield ended
+        yield Told().at(*before)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
