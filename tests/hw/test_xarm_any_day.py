@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
+from far_app.errors import RobotError
 from far_app.motion import TargetIntegrator
 from far_app.protocols import Heartbeat, Hold, Home
 from far_app.types import RobotMode
@@ -41,8 +43,9 @@ def mishap(cell: Cell, rng: np.random.Generator) -> float:
         cell.fake.faults(latency=float(rng.uniform(0.0, 0.008)), jitter=float(rng.uniform(0.0, 0.01)))
     elif kind == 2:
         cell.fake.faults(reports_stalled=True)
-    elif kind == 3 and cell.status.mode is not RobotMode.LATCHED:
-        cell.request(Home())
+    elif kind == 3:
+        with contextlib.suppress(RobotError):  # latched
+            cell.request(Home())
     elif kind == 4:
         cell.request(Hold(reason="pause", latch=bool(rng.random() < 0.3)))
     elif kind == 5:
@@ -78,7 +81,8 @@ def test_no_servo_target_jumps_on_any_day(
         mode = cell.status.mode
         if mode is RobotMode.LATCHED and rng.random() < 0.1:
             fake.faults(**WELL)
-            cell.resume()
+            with contextlib.suppress(RobotError):  # not yet
+                cell.resume()
             resumed.append(time.monotonic())
             integrator = TargetIntegrator(cell.rig.scale, cell.servo.newest.measured.eef)
         elif mode is RobotMode.HOMING and now > silent_until:
