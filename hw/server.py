@@ -44,9 +44,9 @@ from far_app.scheduling import (
     prompt_context,
     real_time_from_here,
 )
+from far_app.signal_event import SignalSafeEvent
 from far_app.station import Station
 from far_app.tasks import task as task_named
-from far_app.told import Told
 from hw.camera_config import with_views
 from hw.camera_thread import CameraThread
 from hw.command_thread import CommandThread
@@ -148,7 +148,7 @@ class Ending:
 
     def __init__(self, parent: int | None) -> None:
         self._parent = parent
-        self._told = Told()
+        self._told = SignalSafeEvent()
         self._reasons: list[str] = []
         signal.signal(signal.SIGTERM, self._on_signal)
         signal.signal(signal.SIGINT, self._on_signal)

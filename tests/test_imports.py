@@ -13,7 +13,7 @@ ROOT = Path(__file__).parent.parent
 CORE = (
     "types", "protocols", "trial", "motion", "aggregation", "config", "wire", "telemetry", "endpoints",
     "session_states", "errors", "tasks", "detectors", "noise", "seeding", "link", "scheduling", "keys", "station",
-    "picture", "preflight", "alarm", "device_input", "take_over", "told",
+    "picture", "preflight", "alarm", "device_input", "take_over", "signal_event",
 )  # fmt: skip
 HEAVY = {"torch", "mujoco", "robosuite", "numba", "cv2", "viser", "rerun", "scipy", "mcap", "h5py", "tyro", "OpenGL"}
 COMPOSERS = ("far_app/cli", "far_app/bench")

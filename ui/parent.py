@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from far_app.errors import FarError
-from far_app.told import Told
+from far_app.signal_event import SignalSafeEvent
 
 log = logging.getLogger(__name__)
 
@@ -30,12 +30,12 @@ def die_with_parent(number: signal.Signals = signal.SIGTERM) -> Callable[[], boo
 
 
 def run_until_told(
-    parse: Callable[[Sequence[str] | None], Options], serve: Callable[[Options, Told], None],
+    parse: Callable[[Sequence[str] | None], Options], serve: Callable[[Options, SignalSafeEvent], None],
     arguments: Sequence[str] | None,
 ) -> int:  # fmt: skip
     """The main of such a process: `serve` what was parsed until SIGTERM or SIGINT; 2 on a FarError, said in the log."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
-    options, ended = parse(arguments), Told().at(signal.SIGTERM, signal.SIGINT)
+    options, ended = parse(arguments), SignalSafeEvent().set_on(signal.SIGTERM, signal.SIGINT)
     try:
         serve(options, ended)
     except FarError as error:

@@ -28,8 +28,8 @@ from far_app.errors import FarError
 from far_app.recording.attempt_reader import read_attempt
 from far_app.recording.replay import LOOPBACK
 from far_app.recording.scan import ends_in_order
+from far_app.signal_event import SignalSafeEvent
 from far_app.telemetry import Telemetry
-from far_app.told import Told
 from ui.access import Access
 from ui.feeds import Latest
 from ui.parent import die_with_parent
@@ -137,7 +137,7 @@ class ClosedAttempts:
         return closed
 
 
-def serve(options: argparse.Namespace, ended: Told) -> None:
+def serve(options: argparse.Namespace, ended: SignalSafeEvent) -> None:
     orphaned = die_with_parent()
     data, program = free_port(), free_port()
     recording = rr.RecordingStream(APPLICATION, recording_id=f"live-{os.getpid()}")
@@ -192,7 +192,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--web-port", type=int, default=0, help="port of the web viewer; 0 takes a free one")
     options = parser.parse_args(arguments)
     os.nice(5)
-    ended = Told().at(signal.SIGTERM, signal.SIGINT)
+    ended = SignalSafeEvent().set_on(signal.SIGTERM, signal.SIGINT)
     try:
         serve(options, ended)
     except FarError as error:

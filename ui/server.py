@@ -22,9 +22,9 @@ from far_app.lineage import VersionWish
 from far_app.marks import MarkAttempt
 from far_app.recording.said_lines import now
 from far_app.session_states import Intent
+from far_app.signal_event import SignalSafeEvent
 from far_app.take_over import Nudge
 from far_app.telemetry import Telemetry
-from far_app.told import Told
 from ui.access import Access
 from ui.console import Console
 from ui.feeds import Feeds
@@ -183,7 +183,7 @@ def signed(said: Any, by: str) -> Any:
     return replace(said, by=by) if isinstance(said, Nudge | VersionWish) else said
 
 
-def serve(options: PageOptions, ended: Told) -> None:
+def serve(options: PageOptions, ended: SignalSafeEvent) -> None:
     """Run the page until `ended` is set or our parent is gone."""
     orphaned = die_with_parent()
     page = Page(options)

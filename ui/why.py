@@ -15,14 +15,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from far_app.told import Told
+from far_app.signal_event import SignalSafeEvent
 from ui.parent import die_with_parent, run_until_told
 from ui.why_view import View, WhyOptions
 
 log = logging.getLogger(__name__)
 
 
-def serve(options: WhyOptions, ended: Told) -> None:
+def serve(options: WhyOptions, ended: SignalSafeEvent) -> None:
     os.nice(5)  # beside a live run it gives way to the loop, the learning and the operator's page
     orphaned = die_with_parent()
     view = View(options)

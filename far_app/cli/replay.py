@@ -9,7 +9,7 @@ import signal
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from far_app.told import Told
+from far_app.signal_event import SignalSafeEvent
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -85,11 +85,11 @@ def _served(log: Path) -> str:
 
 
 @contextlib.contextmanager
-def _interrupts() -> Iterator[Told]:
+def _interrupts() -> Iterator[SignalSafeEvent]:
     """Ctrl-C and SIGTERM end it in order."""
     before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield Told().at(*before)
+        yield SignalSafeEvent().set_on(*before)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

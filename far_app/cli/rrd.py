@@ -15,7 +15,7 @@ from pathlib import Path
 
 from far_app.errors import RecordingError
 from far_app.recording.replay import lacking_rrd, make_rrd
-from far_app.told import Told
+from far_app.signal_event import SignalSafeEvent
 from ui.parent import die_with_parent
 
 log = logging.getLogger(__name__)
@@ -26,7 +26,7 @@ LOOK = 1.0
 
 def main() -> int:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    ended = Told().at(signal.SIGTERM)
+    ended = SignalSafeEvent().set_on(signal.SIGTERM)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     orphaned = die_with_parent()
     with contextlib.suppress(OSError):

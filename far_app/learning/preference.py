@@ -275,4 +275,5 @@ class Objective:
         rows = torch.from_numpy(rng.integers(len(demonstrations.chunks), size=BC_BATCH))
         chunks = demonstrations.chunks[rows]
         draws = draw(rng, BC_BATCH, 1, self.noising.steps, chunks)
-        return noised(self.noising, chunks, demonstrations.features[rows], draws, torch.arange(BC_BATCH))
+        own = torch.arange(BC_BATCH, device=chunks.device)
+        return noised(self.noising, chunks, demonstrations.features[rows], draws, own)

@@ -15,7 +15,7 @@ from far_app.learning import diffusion, fcpa, preference
 from far_app.learning.cancellation import AdaptationCancelledError, never
 from far_app.learning.fast_unet import FastUnet
 from far_app.learning.pairs import Pairs
-from far_app.learning.preference import Demonstrations, Noising, Objective, draw
+from far_app.learning.preference import Cloning, Demonstrations, Noising, Objective, draw
 from far_app.learning.trainable import Trainable, trainable
 from far_app.learning.unet import ConditionalUnet1d
 
@@ -235,6 +235,23 @@ def test_behaviour_cloning_pulls_towards_the_demonstrations(fitted):
     _, cloned = run(config, opposing_pairs(), copy.deepcopy(fitted), demonstrations=demonstrations)
     _, printed = run(FCPAConfig(lr=2e-3, draws=4), opposing_pairs(), copy.deepcopy(fitted))
     assert cloned.history[-1].winner_error < printed.history[-1].winner_error
+
+
+def test_cloning_is_added_once_beside_any_number_of_states():
+    net, pairs = unet(), some_pairs(states=preference.STATES_AT_ONCE + 4)
+    objective = Objective(runner(net), NOISING, pairs, FCPAConfig(), never)
+    g = torch.Generator().manual_seed(1)
+    shown = Demonstrations(features=torch.randn(9, F, generator=g), chunks=torch.rand(9, H, A, generator=g))
+    draws = draw(np.random.default_rng(2), len(pairs.features), 2, NOISING.steps, LIKE)
+
+    def cloning() -> Cloning:
+        return Cloning(demonstrations=shown, weight=0.3, rng=np.random.default_rng(3))
+
+    noisy = objective.cloned(cloning())
+    error = (noisy.noise - net(noisy.chunks, noisy.k, noisy.features[noisy.state])).square().sum((1, 2)).mean()
+    expected = torch.cat([x.flatten() for x in torch.autograd.grad(0.3 * error, list(net.parameters()))])
+    found = objective.gradient(draws, cloning()) - objective.gradient(draws)
+    assert (found - expected).norm() < 1e-4 * expected.norm()
 
 
 def test_meaningless_combinations_are_refused():
