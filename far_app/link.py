@@ -19,7 +19,7 @@ import zmq
 from far_app.endpoints import Call, Endpoints, Reply
 from far_app.errors import ArmTaken, RobotError
 from far_app.protocols import Guide, Heartbeat, Hold, Request, Reset, Resume
-from far_app.scheduling import prompt_context
+from far_app.scheduling import SERVING_PRIORITY, prompt_context, real_time
 from far_app.station import LIMIT, ClockThread, RobotClock, myself, spoken
 from far_app.types import Ack, Observation, Target
 from far_app.wire import WireError, pack, unpack
@@ -127,6 +127,7 @@ class RemoteRobot:
     # ── observations ──
 
     def _receive(self) -> None:
+        real_time(SERVING_PRIORITY)
         socket = self._context.socket(zmq.SUB)
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.RCVHWM, 256)

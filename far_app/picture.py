@@ -75,11 +75,15 @@ def framed(frame: UInt8[np.ndarray, "H W 3"], framing: Framing) -> UInt8[np.ndar
     return frame[top : top + height, left : left + width]
 
 
-def seen(frame: UInt8[np.ndarray, "H W 3"], framing: Framing, size: int) -> UInt8[np.ndarray, "size size 3"]:
-    """The picture a policy sees of a frame. One that is `size` × `size` already comes back unchanged."""
+def seen(
+    frame: UInt8[np.ndarray, "H W 3"], framing: Framing, size: int, *, quick: bool = False
+) -> UInt8[np.ndarray, "size size 3"]:
+    """The picture a policy sees of a frame. One that is `size` × `size` already comes back unchanged. `quick`: for
+    people, who need no average over every pixel's area; a quarter of the time."""
     picture = np.ascontiguousarray(framed(frame, framing))
     if picture.shape[:2] == (size, size):
         return picture
     import cv2  # here: the core loads nothing heavier than numpy
 
-    return np.asarray(cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA), np.uint8)
+    way = cv2.INTER_LINEAR if quick else cv2.INTER_AREA
+    return np.asarray(cv2.resize(picture, (size, size), interpolation=way), np.uint8)

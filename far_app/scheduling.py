@@ -2,11 +2,14 @@
 
 Real time (SCHED_FIFO) is for what runs a moment and must not wait its turn; the higher number goes first:
 
-    STOP 21 · servo 20 · messages between app and arm 15 · the app's loop 10 · the rest of a real arm's hw server 5
+    STOP 21 · servo 20 · messages between app and arm 15 · the app's loop 10 · what serves it in its interpreter 6 ·
+    the rest of a real arm's hw server 5
 
 The rest share the cores by niceness; a thread that runs Python beside one of the above holds its interpreter, and must
-itself not wait long for a core. In the hw server of a real arm STOP could be kept waiting that way: there all are real
-time (`real_time_from_here`).
+itself not wait long for a core: the loop then waits for the interpreter as long as its holder waits for its turn. So
+the app's recorder, its telemetry and those who read for it are real time too (beside a real arm the loop's lateness at
+99 % fell to a third by that). In the hw server of a real arm STOP could be kept waiting that way: there all are
+(`real_time_from_here`).
 """
 
 from __future__ import annotations
@@ -23,6 +26,8 @@ STOP_PRIORITY = 21
 SERVO_PRIORITY = 20
 MESSAGE_PRIORITY = 15
 LOOP_PRIORITY = 10
+SERVING_PRIORITY = 6
+"""Of threads that do little and often hold the loop's interpreter: recorder, telemetry, observations, intents."""
 HARDWARE_PRIORITY = 5
 
 SERVO_NICENESS = -15

@@ -94,7 +94,7 @@ class CameraThread:
         try:
             view = self._make_view()
             policy = self._cameras(view, self._rig.policy_image)
-            operator = self._cameras(view, self._rig.operator_image)
+            operator = self._cameras(view, self._rig.operator_image, quick=True)
             self.geometry = view.geometry()
             self._draw(policy)
             for camera in operator:
@@ -120,9 +120,9 @@ class CameraThread:
             socket.close()
             view.close()
 
-    def _cameras(self, view: PlantView, size: int) -> list[Camera]:
+    def _cameras(self, view: PlantView, size: int, *, quick: bool = False) -> list[Camera]:
         if isinstance(view, HardwareView):
-            return [view.camera(name, size) for name in self._task.cameras]
+            return [view.camera(name, size, quick=quick) for name in self._task.cameras]
         return [TwinCamera(name, size, view, lambda: self._moment) for name in self._task.cameras]
 
     def _loop(self, view: PlantView, policy: list[Camera], operator: list[Camera], socket: zmq.Socket[bytes]) -> None:
@@ -166,7 +166,7 @@ class CameraThread:
             self._on_failure(trouble)
 
     def _draw_for_operator(self, camera: Camera) -> None:
-        bgr = np.ascontiguousarray(camera.frame().image[:, :, ::-1])
+        bgr = cv2.cvtColor(camera.frame().image, cv2.COLOR_RGB2BGR)
         _, jpeg = cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
         self._jpegs[camera.name] = jpeg.tobytes()
 

@@ -9,6 +9,7 @@ import logging
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
@@ -27,9 +28,10 @@ log = logging.getLogger(__name__)
 class HardwareCamera:
     """far_app.protocols.Camera over one view of a reader's frames, at one size."""
 
-    def __init__(self, name: str, size: int, reader: CameraReader, framing: Framing) -> None:
+    def __init__(self, name: str, size: int, reader: CameraReader, framing: Framing, *, quick: bool = False) -> None:
+        """`quick`: its pictures are for people (far_app/picture.py)."""
         self.name, self.height, self.width = name, size, size
-        self._reader, self._framing = reader, framing
+        self._reader, self._framing, self._quick = reader, framing, quick
         self._shot: Shot | None = None
         self._frame: Frame
 
@@ -38,8 +40,8 @@ class HardwareCamera:
         shot = self._reader.newest
         if shot is not self._shot:
             seq = self._frame.seq + 1 if self._shot is not None else 0
-            bgr = seen(shot.image, self._framing, self.height)
-            self._frame = Frame(image=np.ascontiguousarray(bgr[:, :, ::-1]), stamp=shot.stamp, seq=seq)
+            bgr = seen(shot.image, self._framing, self.height, quick=self._quick)
+            self._frame = Frame(image=cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), stamp=shot.stamp, seq=seq)
             self._shot = shot
         return self._frame
 
@@ -64,7 +66,7 @@ class HardwareView:
             for name, config in cameras.items()
             for view, framing in config.views(name).items()
         }
-        self._cameras: dict[tuple[str, int], HardwareCamera] = {}
+        self._cameras: dict[tuple[str, int, bool], HardwareCamera] = {}
         try:
             for reader in self.readers.values():
                 reader.start()
@@ -72,13 +74,13 @@ class HardwareView:
             self.close()
             raise
 
-    def camera(self, name: str, size: int) -> HardwareCamera:
-        """A view of these cameras at a size."""
+    def camera(self, name: str, size: int, *, quick: bool = False) -> HardwareCamera:
+        """A view of these cameras at a size; a quick one for people."""
         if name not in self._views:
             raise ConfigError(f"the rig has no camera view '{name}'; it has {', '.join(self._views)}")
-        if (name, size) not in self._cameras:
-            self._cameras[name, size] = HardwareCamera(name, size, *self._views[name])
-        return self._cameras[name, size]
+        if (name, size, quick) not in self._cameras:
+            self._cameras[name, size, quick] = HardwareCamera(name, size, *self._views[name], quick=quick)
+        return self._cameras[name, size, quick]
 
     def health(self, now: float) -> dict[str, CameraHealth]:
         """Of every view: its camera's."""

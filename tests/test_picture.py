@@ -35,6 +35,12 @@ def test_shrinking_averages_areas_and_leaves_channels_apart():
     assert np.array_equal(seen(FRAME[:, :, ::-1], Framing(), 24), seen(FRAME, Framing(), 24)[:, :, ::-1])
 
 
+def test_a_quick_picture_is_of_the_same_part_of_the_frame():
+    slope = np.broadcast_to(np.arange(256, dtype=np.uint8)[None, :, None], (72, 256, 3))
+    exact, quick = (seen(slope, Framing(eye="left"), 54, quick=q).astype(int) for q in (False, True))
+    assert np.abs(exact - quick).max() <= 1
+
+
 @pytest.mark.parametrize(("settings", "word"), [
     ({"rotate": 45}, "rotate is 45"), ({"eye": "third"}, "third"), ({"crop": (0, 0, 5)}, "left, top"),
 ])  # fmt: skip

@@ -14,6 +14,8 @@ from ui.view_model import AdaptationCard, Banner, Freshness, Gauge, Tone
 
 HISTORY_ROWS = 40
 LOG_LINES = 30
+PIPS = 24
+"""Attempts of a trial that are drawn as a pip each; more than that are told by number alone."""
 ONE_COLUMN = 13
 """Keys that fit below each other; more of them stand in two columns."""
 
@@ -22,7 +24,7 @@ def head(banner: Banner, arm: tuple[str, Tone]) -> str:
     """The full-width head: state word, attempt k/N, where we are, progress."""
     pips = "".join(
         f'<i class="{"on" if k < banner.attempt else "now" if k == banner.attempt else ""}"></i>'
-        for k in range(1, banner.max_attempts + 1)
+        for k in range(1, banner.max_attempts + 1 if banner.max_attempts <= PIPS else 1)
     )
     share = 100 * min(1.0, banner.tick / banner.horizon) if banner.horizon else 0
     arm_text, arm_tone = arm

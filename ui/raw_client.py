@@ -1,6 +1,6 @@
 """A page without a browser: connects like one, reads everything, may press what it sees. For benchmarks and tests.
 
-python -m ui.raw_client http://127.0.0.1:8080 --seconds 60    keeps one client connected
+python -m ui.raw_client http://127.0.0.1:8080 --seconds 60    one client that looks at it all along
 """
 
 from __future__ import annotations
@@ -106,6 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         client = RawClient(options.url)
+        client.look()
+        print("looking", flush=True)
         client.read(options.seconds)
         client.close()
     except (OSError, WebSocketException) as error:

@@ -1,9 +1,10 @@
 """`far bench loop`: does learning disturb control? The whole application for a while, half of it with FCPA running.
 
-The twin at 30 Hz with recording, the page's process and one connected client (a raw WebSocket: a browser on the same
-cores would measure the browser). Lateness is that of a target's acceptance in the hw server; `floor` is a bare sleeper
-in a process of its own, all along, with a fixed piece of work at each wake-up: where that takes many times its median,
-the machine itself stalled.
+At 30 Hz with recording, the page's process and one connected client (a raw WebSocket: a browser on the same cores would
+measure the browser). The arm is the twin, or with `--robot xarm` a real one as the program sees it: the driver and the
+SDK on a fake controller, synthetic cameras, and nothing to be simulated or drawn on these cores. Lateness is that of a
+target's acceptance in the hw server; `floor` is a bare sleeper in a process of its own, all along, with a fixed piece
+of work at each wake-up: where that takes many times its median, the machine itself stalled.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
@@ -26,18 +27,21 @@ from far_app.bench.report import write
 from far_app.cli.options import EngineName, RunOptions
 from far_app.cli.settings import recommended
 from far_app.cli.stage import Stage, stage
+from far_app.endpoints import Endpoints
 from far_app.errors import ConfigError, FarError
 from far_app.protocols import Method
 from far_app.session.adaptation import BackgroundAdaptation, unchanged
 from far_app.session.inbox import IntentInbox
+from far_app.session.session import Session
 from far_app.session.statistics import LoopStatistics, percentiles
-from far_app.session_states import Intent
+from far_app.session_states import Intent, State
 from far_app.types import Attempt
+from hw.fake_xarm.control import FakeXArm
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoopOptions:
-    """Lateness of the 30 Hz loop with everything running, idle and adapting."""
+    """Lateness of the 30 Hz loop with everything running, idle and adapting; and how old its plans are."""
 
     seconds: float = 60.0
     """How long to measure, both halves together."""
@@ -49,6 +53,10 @@ class LoopOptions:
     """Critic checkpoint; the one beside the policy by default."""
     engine: EngineName = "auto"
     """Runs the policy, as in `far run`."""
+    robot: Literal["twin", "xarm"] = "twin"
+    """xarm: the real driver on a fake controller of its own, the rig hw/rigs/rehearsal.toml."""
+    fake: str = "127.114.77.1:15502"
+    """Where that controller listens."""
     seed: int = 0
     port: int = 0
     """The page's port; 0 takes a free one."""
@@ -69,12 +77,12 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def measure(options: LoopOptions) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory(prefix="far-bench-") as recordings:
+    with tempfile.TemporaryDirectory(prefix="far-bench-") as recordings, arm(options) as there:
         run = RunOptions(
             seed=options.seed, policy=options.policy, critic=options.critic, port=options.port, method="far",
             engine=options.engine,
             headless=not options.page, rerun=False, torch_threads=options.torch_threads, recordings=Path(recordings),
-            retry=recommended(RunOptions.task, options.policy),
+            retry=recommended(RunOptions.task, options.policy), **there,
         )  # fmt: skip
         with stage(run) as stage_, client(stage_.page_url, options.seconds) as connected:
             half = options.seconds / 2
@@ -92,6 +100,23 @@ def measure(options: LoopOptions) -> dict[str, Any]:
         | {"floor": _floor(woken, adapting_span), "adaptations": len(rounds)},
         "floor": _floor(woken, (0.0, float("inf"))),
     }
+
+
+@contextlib.contextmanager
+def arm(options: LoopOptions) -> Iterator[dict[str, Any]]:
+    """What `far run` is told about the arm, which is there meanwhile. Nobody judges: every attempt fails."""
+    if options.robot == "twin":
+        yield {}
+        return
+    address, _, port = options.fake.partition(":")
+    fake = FakeXArm.start(address, int(port))
+    try:
+        yield {
+            "rig": "rehearsal", "host": options.fake, "accept_differences": True, "full_speed": True, "judge_wait": 0.0,
+            "max_attempts": 1000,
+        }  # fmt: skip
+    finally:
+        fake.close()
 
 
 THREADS = ("recorder", "telemetry")
@@ -114,7 +139,7 @@ def naive_trials(
     stage_: Stage, seconds: float, threads: dict[str, float] | None = None
 ) -> tuple[LoopStatistics, Attempt | None]:
     """Trials under naive retry for so long; returns the last failed attempt, if one failed."""
-    statistics, inbox = LoopStatistics(), IntentInbox()
+    statistics, inbox = LoopStatistics(), IntentInbox(Endpoints.in_folder(stage_.folder).intents)
 
     def end() -> None:
         if threads is not None:
@@ -123,12 +148,33 @@ def naive_trials(
 
     timer = threading.Timer(seconds, end)
     timer.daemon = True
-    with stage_.session(stage_.writer(), inbox, statistics, method=Unlearning(stage_.parts.method)) as session_:
+    method = Unlearning(stage_.parts.method)
+    with contextlib.closing(inbox), stage_.session(stage_.writer(), inbox, statistics, method=method) as session_:
         timer.start()
-        session_.run()
+        with scene_ready(session_, inbox):
+            session_.run()
     if session_.recorder.error is not None:
         raise session_.recorder.error
     return statistics, session_.driver.last_failure
+
+
+@contextlib.contextmanager
+def scene_ready(session_: Session, inbox: IntentInbox) -> Iterator[None]:
+    """Whenever the session asks for the scene of a real arm, it is told that it is there."""
+    ended = threading.Event()
+
+    def answer() -> None:
+        while not ended.wait(0.2):
+            if session_.standing.state is State.AWAITING_SCENE:
+                inbox.put(Intent.SCENE_READY)
+
+    thread = threading.Thread(target=answer, name="bench-scene", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def processor_seconds(names: Sequence[str]) -> dict[str, float]:
@@ -205,7 +251,9 @@ def client(page_url: str, seconds: float) -> Iterator[bool]:
         yield False
         return
     command = [sys.executable, "-m", "ui.raw_client", page_url, "--seconds", str(seconds + 60)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    assert process.stdout is not None
+    process.stdout.readline()  # it looks; without somebody who does, a real arm is held
     try:
         yield True
         if process.poll() is not None:

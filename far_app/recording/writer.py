@@ -27,6 +27,7 @@ from far_app.recording.scene_file import SceneAccepted
 from far_app.recording.schema import SCHEMA_VERSION, AttemptHeader, SessionInfo, json_schemas
 from far_app.recording.session_files import SessionFiles
 from far_app.recording.session_folder import SPACE_TO_GO_ON, SPACE_TO_START, attempt_name
+from far_app.scheduling import SERVING_PRIORITY, real_time
 from far_app.types import ActionChunk, Adaptation, AdaptationStep, AdaptedWeights, Attempt, Outcome, Step, TickTimes
 
 log = logging.getLogger(__name__)
@@ -224,6 +225,7 @@ class SessionWriter:
 
     def _run(self) -> None:
         """The thread: works the queue down, flushes in between, ends at None or at the first error."""
+        real_time(SERVING_PRIORITY)
         due = time.monotonic() + FLUSH_INTERVAL
         try:
             while True:

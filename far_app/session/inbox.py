@@ -12,6 +12,7 @@ import zmq
 
 from far_app.lineage import VersionWish
 from far_app.marks import MarkAttempt
+from far_app.scheduling import SERVING_PRIORITY, real_time
 from far_app.session_states import Intent
 from far_app.take_over import Nudge
 from far_app.telemetry import OperatorIntent, PagePresence
@@ -70,6 +71,7 @@ class IntentInbox:
             self._socket.close(linger=0)
 
     def _receive(self) -> None:
+        real_time(SERVING_PRIORITY)
         while not self._closing.is_set():
             if not self._socket.poll(100):
                 continue

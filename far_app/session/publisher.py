@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import zmq
 
+from far_app.scheduling import SERVING_PRIORITY, real_time
 from far_app.telemetry import LoopHealth, Telemetry
 from far_app.wire import Packer
 
@@ -42,6 +43,7 @@ class TelemetryPublisher:
         self._socket.close(linger=200)
 
     def _publish(self) -> None:
+        real_time(SERVING_PRIORITY)
         closing, packer = False, Packer()
         loop, next_health = LoopHealth(), 0.0
         while not closing:

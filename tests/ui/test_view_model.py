@@ -127,6 +127,14 @@ def test_the_session_in_one_line() -> None:
     assert summary(()) == "no trial finished yet"
 
 
+def test_the_head_draws_as_many_attempts_as_can_be_told_apart() -> None:
+    pips = [
+        html.head(banner(replace(running(), max_attempts=n), FRESH), ("", Tone.IDLE)).count("<i class=")
+        for n in (5, html.PIPS, html.PIPS + 1, 1_000_000)
+    ]
+    assert pips == [5, html.PIPS, 0, 0]
+
+
 def test_foreign_text_is_escaped_everywhere() -> None:
     evil = "<img src=x onerror=alert(1)>"
     telemetry: Telemetry = replace(
