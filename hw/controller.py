@@ -9,7 +9,8 @@
     HOLD, TRACKING ──Guide──▶ GUIDED (led by hand) ──Guide off, no heartbeat──▶ HOLD
     HOLD, TRACKING ──Home──▶ HOMING ──home and settled──▶ HOLD      HOMING without heartbeats stands still
 
-Motion after any hold starts from the measured pose. The same controller serves the twin (120 Hz) and a real arm.
+Motion after any hold starts from the measured pose, once the arm has come to rest. The same controller serves the twin
+(120 Hz) and a real arm.
 """
 
 from __future__ import annotations
@@ -142,6 +143,10 @@ class ArmController:
     def stop(self, reason: str) -> None:
         """Latch. Any thread, any time: a plain assignment that the next servo tick acts on before all else."""
         self._stop_reason = reason or "STOP"
+
+    def stand(self) -> None:
+        """The arm was stopped by other means than its command and stands where it was last measured."""
+        self._anchor()
 
     def fail(self, reason: str) -> None:
         """Latch by a fault that others noticed: a lost camera, a dead servo loop."""
@@ -296,7 +301,7 @@ class ArmController:
             raise RobotError(f"Resume refused: the arm still reports '{self.measured.error}'; clear it at the arm")
         self.refuse_unlatching()
         if self.mode is RobotMode.LATCHED:
-            self._anchor()
+            self._state = self._departure()
             self._hold("resumed by the operator")
             self.fault, self._at_home = False, False
 

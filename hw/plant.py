@@ -63,9 +63,10 @@ class Plant(Protocol):
         never raises. Until `rearm` nothing more is sent. The twin's latch is enough: no-op."""
         ...
 
-    def rearm(self) -> None:
+    def rearm(self) -> bool:
         """The operator pressed Resume: clear the arm's errors and be ready for commands from where it stands, without
-        moving. May block for seconds; raises RobotError saying what is still wrong. Twin: no-op."""
+        moving. True where it was stopped by other means than its command, and stands where it says. May block for
+        seconds; raises RobotError saying what is still wrong. Twin: no-op, False: it follows the command all along."""
         ...
 
     guided: bool

@@ -109,10 +109,12 @@ class ServoThread:
         def work() -> None:
             with self._lock:
                 self._controller.refuse_unlatching()
-            self._plant.rearm()
+            stands = self._plant.rearm()
             measured = self._plant.measure()
             with self._lock:
                 self._controller.measured = measured
+                if stands:
+                    self._controller.stand()
                 self._controller.request(Resume(), time.monotonic())
 
         return self.call(work)

@@ -218,7 +218,8 @@ class TwinPlant:
         if on:
             raise RobotError("the twin cannot be led by hand: steer it (--teleop), or give --robot xarm")
 
-    def rearm(self) -> None: ...
+    def rearm(self) -> bool:
+        return False
 
     def close(self) -> None: ...
 

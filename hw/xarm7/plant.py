@@ -134,7 +134,7 @@ class XArmPlant:
             self._arm(halts)
         self.guided = on
 
-    def rearm(self) -> None:
+    def rearm(self) -> bool:
         """On the operator's Resume only. Blocks for a second or so, ten when it must reconnect. Raises RobotError."""
         halts = self._halts
         if self.links.lost() or self._unanswered >= UNANSWERED:
@@ -147,6 +147,7 @@ class XArmPlant:
         self.links.gripper.enable_again()
         self._arm(halts)
         self._fault = ""
+        return True
 
     def close(self) -> None:
         """Leave servo mode, let go of the connections."""

@@ -153,13 +153,17 @@ def test_motion_after_a_hold_starts_from_the_measured_pose() -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_no_hold_makes_the_command_of_a_lagging_arm_jump(seed: int) -> None:
-    """Holds by silence, however short, on the way and on the way home, requests in the midst of them, and an arm whose
-    reports stop for a while."""
+    """Holds by silence, however short, on the way and on the way home, requests in the midst of them, STOP and Resume
+    in no time, and an arm whose reports stop for a while."""
     arm, rng = Arm(), np.random.default_rng(seed)
     lag = int(rng.integers(1, 13))
     for _ in range(60):
-        what = rng.integers(4)
-        if what == 0 and arm.mode is not RobotMode.HOMING:
+        what = rng.integers(5)
+        if arm.mode is RobotMode.LATCHED:
+            arm.controller.request(Resume(), arm.now)
+        elif what == 2:
+            arm.controller.stop("STOP")
+        elif what == 0 and arm.mode is not RobotMode.HOMING:
             arm.controller.request(Home(), arm.now)
         elif what == 1:
             arm.controller.request(Hold(reason="pause", latch=False), arm.now)
@@ -234,6 +238,7 @@ def test_a_breach_of_the_workspace_latches_and_after_resume_only_the_way_back_is
     assert arm.controller.status().fault
     assert "outside the workspace box" in arm.controller.status().reason
     arm.offset = low - arm.commanded[-1].position
+    arm.tick(40)  # it has come to rest
     arm.controller.request(Resume(), arm.now)
     arm.offset = np.zeros(3)
     arm.measured = replace(arm.measured, eef=Pose(position=low, quaternion=START.quaternion))

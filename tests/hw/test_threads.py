@@ -57,8 +57,9 @@ class KinematicPlant:
     def halt(self) -> None:
         self.halts += 1
 
-    def rearm(self) -> None:
+    def rearm(self) -> bool:
         self.rearmed += 1
+        return True
 
     def close(self) -> None: ...
 
