@@ -16,7 +16,7 @@ from far_app.types import TICK_STAGES
 PHASE = {
     "ticks": 900, "late_ms": {"p50": 0.1, "p99": 2.0, "p999": 3.0},
     "floor": {"ticks": 1000, "late_ms": {"p50": 0.05, "p99": 0.1, "p999": 0.4}, "work_ms": {"p50": 0.2, "p99": 0.9}},
-    "threads_ms": {"recorder": 0.2, "telemetry": 0.1},
+    "threads_ms": {"recorder": 0.2, "telemetry": 0.1}, "plan_age_ticks": {"p50": 2.0, "p99": 3.0},
     "stages_ms": {s: {"p50": 0.1 * (i + 1), "p99": 1.0, "mean": 0.2} for i, s in enumerate(TICK_STAGES)}
     | {"filter": {"p50": None, "p99": None, "mean": None}},
 }  # fmt: skip
@@ -30,6 +30,7 @@ REPORTS = {
               "cancel_ms": {"p50": 20.0, "p99": 60.0}, "growth": []},
 }  # fmt: skip
 REPORTS["adapt-paper"] = REPORTS["adapt"]
+REPORTS["loop-arm"] = REPORTS["loop"]
 
 
 def report(name: str) -> dict:
@@ -103,6 +104,8 @@ def test_the_page_says_ratio_and_whether_the_target_was_reached(tmp_path: Path):
     assert "| an adaptation, the loop running | 3 s | 12 | 4.0 |" in page
     assert "| idle: record | 0.6 ms | |" in page.replace("|  |", "| |") and "≤ 0.3 not reached" in page
     assert "| idle: lateness beyond the sleeper's, 99.9 % | 2.6 ms |" in page, "3.0 and 0.4"
+    assert page.count("| adapting: age of the plan acted on | 2 ticks |  |  | 3 | ≤ 1 not reached |") == 2
+    assert "## The tick, the real driver and the paper's network" in page
     assert "| adapting: what a fixed piece of work takes it | 0.2 ms |  |  | 0.9 |" in page
     assert "Learning from a failure, the paper's network" in page and "≤ 10 ✓" in page
     assert "idle: filter" not in page, "a stage nobody measured has no row"

@@ -30,6 +30,7 @@ BENCHMARKS: dict[str, tuple[str, ...]] = {
         "--policy", "untrained:paper", "--seed", "3", "--rounds", "10", "--plain-rounds", "3", "--growth", "",
     ),
     "page": ("--speed", "150"), "loop": ("--seconds", "120"),
+    "loop-arm": ("--robot", "xarm", "--policy", "untrained:paper", "--engine", "openvino-bf16", "--seconds", "120"),
 }  # fmt: skip
 """What runs, in this order, and with which arguments beside --json; last what needs most of the machine. What follows a
 hyphen tells two runs of one benchmark apart. (Seed 3: on some scenes random weights drive the hand out of its box.)"""
@@ -141,7 +142,7 @@ def rows_of(name: str, report: Mapping[str, Any]) -> list[dict[str, Any]]:
     these amount to."""
     if "rows" in report:
         return list(report["rows"])
-    if name == "loop":
+    if name.startswith("loop"):
         return loop_rows(report)
     if name == "infer":
         return [
@@ -169,6 +170,8 @@ ADAPTATIONS = {"adapt": 4.0, "adapt-paper": 10.0}
 """Seconds of an adaptation of the quickstart preset on two cores, and of the paper's."""
 CANCEL = 100.0
 """Milliseconds until one is cancelled."""
+EVERY_TICK = 1.0
+"""Ticks from a plan's observation to its first action where every tick is planned anew."""
 BEYOND = 2.0
 """Milliseconds that the loop may be later than a bare sleeper, at the 99.9th percentile."""
 LOOP_TARGETS = {"record": 0.3, "publish": 0.2, "recorder": 0.3, "telemetry": 0.2}
@@ -196,6 +199,9 @@ def loop_rows(report: Mapping[str, Any]) -> list[dict[str, Any]]:
             for stage, ms in found["stages_ms"].items()
             if ms["p50"] is not None
         ]  # fmt: skip
+        age = found["plan_age_ticks"]
+        rows.append(_row(f"{phase}: age of the plan acted on", "ticks", age["p50"], p99=age["p99"], repeats=ticks,
+                         target=EVERY_TICK))  # fmt: skip
         rows += [
             _row(f"{phase}: the {thread} thread's processor time", "ms", ms, repeats=ticks, target=LOOP_TARGETS[thread])
             for thread, ms in found["threads_ms"].items()

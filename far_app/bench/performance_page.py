@@ -11,7 +11,8 @@ from far_app.bench.rows import Row
 from far_app.types import TICK_STAGES
 
 TITLES = {
-    "loop": "The tick", "render": "Drawing the twin", "infer": "A chunk", "adapt": "Learning from a failure",
+    "loop": "The tick", "loop-arm": "The tick, the real driver and the paper's network", "render": "Drawing the twin",
+    "infer": "A chunk", "adapt": "Learning from a failure",
     "adapt-paper": "Learning from a failure, the paper's network", "train": "Training", "evaluate": "Evaluation",
     "start": "Starting",
 }  # fmt: skip

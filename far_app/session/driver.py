@@ -42,13 +42,8 @@ class Driver:
         clock: TickClock, detector: OperatorOverride, standing: Standing, supervision: Supervision, helper: Helper,
         operator: Operator, versions: VersionKeeper, lessons: Lessons,
     ) -> None:  # fmt: skip
-        self.settings, self.planner, self.inbox, self.statistics, self.clock = (
-            settings,
-            planner,
-            inbox,
-            statistics,
-            clock,
-        )
+        self.settings, self.planner, self.inbox = settings, planner, inbox
+        self.statistics, self.clock = statistics, clock
         self.robot, self.recorder, self.board = standing.robot, standing.recorder, standing.board
         self.detector, self.standing, self.supervision, self.helper = detector, standing, supervision, helper
         self.operator, self.versions, self.lessons = operator, versions, lessons

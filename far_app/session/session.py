@@ -89,10 +89,8 @@ class Session:
         self.helper = Helper(self.standing, inbox, scale)
         marking = Marking(self.standing, settings.name)
         self.versions = VersionKeeper(self.standing, method, recorder.folder, self.course.fixed)
-        self.inbox, self.operator = (
-            inbox,
-            Operator(inbox, self.standing, self.helper, marking, self.versions, self.clock.period),
-        )
+        self.inbox = inbox
+        self.operator = Operator(inbox, self.standing, self.helper, marking, self.versions, self.clock.period)
         self.supervision = Supervision(
             standing=self.standing, operator=self.operator, helper=self.helper, planner=planner, clock=self.clock,
             freshness=settings.freshness, headless=settings.headless, page_silence=settings.page_silence,
