@@ -6,11 +6,13 @@ tunnel on a client's word, and lets a client's message write any field of a butt
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
 import logging
 import math
 import socket
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -46,22 +48,30 @@ def open_page(access: Access, port: int, presence: Presence, doors: Doors = lamb
 
 @contextlib.contextmanager
 def _serving(listener: socket.socket, port: int, access: Access, presence: Presence, doors: Doors) -> Iterator[None]:
-    """While a ViserServer starts, its websocket server gets our socket, our rules and our look at who is there."""
-    original = websocket_server.serve
+    """While a ViserServer starts, its websocket server gets our socket, our rules and our look at who is there. Who
+    comes before it is complete (a browser that lost the page before) waits: viser would fail on what it lacks yet."""
+    original, complete = websocket_server.serve, threading.Event()
 
     def serve(handler: Any, host: Any = None, wanted: Any = None, *, process_request: Any, **kwargs: Any) -> Any:
         def answer(connection: ServerConnection, request: Request) -> Response | None:
             refused = access.respond(request, port, doors)
             return refused if refused is not None else process_request(connection, request)
 
+        async def in_time(connection: ServerConnection) -> None:
+            while not complete.is_set():
+                await asyncio.sleep(0.01)
+            await watched(connection)
+
+        watched = presence.around(handler)
         kwargs.update(sock=listener, process_request=answer, max_size=MAX_MESSAGE)
-        return original(presence.around(handler), **kwargs)
+        return original(in_time, **kwargs)
 
     websocket_server.serve = serve  # type: ignore[assignment]
     try:
         yield
     finally:
         websocket_server.serve = original  # type: ignore[assignment]
+        complete.set()
 
 
 class Presses:

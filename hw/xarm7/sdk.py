@@ -10,8 +10,10 @@ from __future__ import annotations
 import logging
 import socket
 import threading
+from types import SimpleNamespace
 from typing import Any, Literal
 
+from xarm.core.comm import socket_port
 from xarm.core.config.x_code import ControllerError, GripperError
 from xarm.core.config.x_config import XCONF
 from xarm.core.utils.log import logger as sdk_logger
@@ -34,6 +36,10 @@ MANUAL_MODE = 2
 ABLE = (1, 2)
 """States in which the arm follows: moving, ready."""
 KEEPALIVE = ((socket.TCP_KEEPIDLE, 2), (socket.TCP_KEEPINTVL, 1), (socket.TCP_KEEPCNT, 3))
+
+socket_port.socket = SimpleNamespace(**vars(socket) | {"setdefaulttimeout": lambda seconds: None})  # type: ignore[assignment]
+"""The SDK's own view of the module: at every connection, also those that its threads make anew, it would set the whole
+process's timeout to one second. Its sockets get theirs by themselves."""
 
 sdk_logger.setLevel(logging.CRITICAL)  # it writes a line for every failed call; the driver says once what happened
 sdk_printer.setLevel(logging.CRITICAL)
@@ -61,7 +67,6 @@ def connect(settings: XArmSettings, report: Report, timeout: float) -> XArmAPI:
     thread = threading.Thread(target=make, name="xarm-connect", daemon=True)
     thread.start()
     thread.join(settings.connect_timeout)
-    socket.setdefaulttimeout(None)  # the SDK sets it to one second for the whole process
     where = f"{settings.address}:{settings.port}"
     if not made:
         raise RobotError(

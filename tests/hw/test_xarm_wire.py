@@ -19,6 +19,7 @@ from hw.controller import ArmController
 from hw.fake_xarm.control import FakeXArm
 from hw.fake_xarm.protocol import Function
 from hw.rig import at_address, load_rig
+from hw.xarm7 import sdk
 from hw.xarm7.plant import XArmPlant
 from hw.xarm7.sdk import connect
 from tests.hw.cell import BACK, FORWARD, TASK, Cell, rig_at, steps
@@ -38,6 +39,15 @@ def cell(fake: FakeXArm) -> Iterator[Cell]:
     cell.close()
 
 
+def test_the_sdk_leaves_the_timeout_of_the_whole_process_alone(fake: FakeXArm) -> None:
+    """Its threads connect anew by themselves, so that undoing it after each connection would be too early."""
+    for port in (FAKE_PORT, 1):
+        connection = sdk.socket_port.SocketPort(fake.address, port, forbid_uds=True)
+        assert socket.getdefaulttimeout() is None
+        assert connection.connected == (port == FAKE_PORT)
+        connection.close()
+
+
 def test_the_start_sequence_ends_in_servo_mode_primed_with_the_present_pose(cell: Cell, fake: FakeXArm) -> None:
     received = fake.received()
     setup = [
@@ -54,7 +64,7 @@ def test_the_start_sequence_ends_in_servo_mode_primed_with_the_present_pose(cell
     functions = {r["function"] for r in received}
     assert Function.SET_COLLISION_SENSITIVITY not in functions
     assert Function.CLEAN_ERR not in functions
-    assert socket.getdefaulttimeout() is None, "the SDK's change of the whole process is undone"
+    assert socket.getdefaulttimeout() is None
 
 
 def test_servo_steps_keep_the_rigs_limits_at_every_tick(

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import atexit
 import math
+import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from ui_process import wait_until
+import viser
+from ui_process import free_port, wait_until
 
 from ui.access import Access
 from ui.page_server import Presses, open_page
@@ -18,9 +22,9 @@ from ui.raw_client import RawClient
 class Served:
     """A page with one button, one for everyone, and one slider; `did` is what came of the messages."""
 
-    def __init__(self) -> None:
+    def __init__(self, port: int = 0) -> None:
         presence = Presence()
-        self.server = open_page(Access(), 0, presence, {"there": "http://127.0.0.1:1/?x=1"}.get)
+        self.server = open_page(Access(), port, presence, {"there": "http://127.0.0.1:1/?x=1"}.get)
         self.url = f"http://127.0.0.1:{self.server.get_port()}"
         self.did: list[Any] = []
         presses = Presses(self.server, presence)
@@ -40,6 +44,40 @@ def served() -> Iterator[Served]:
     page = Served()
     yield page
     page.server.stop()
+
+
+def test_who_comes_while_the_page_is_being_made_is_served_once_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a browser does that lost the page before: the port is open before viser's server is complete, which then
+    lacks what a connection needs and would close it."""
+    register, came = atexit.register, threading.Event()
+    pages: list[Served] = []
+
+    def slow(function: Any, *words: Any) -> Any:
+        if isinstance(getattr(function, "__self__", None), viser.ViserServer):  # it listens, and has no event loop yet
+            came.wait(5.0)
+            time.sleep(0.3)
+        return register(function, *words)
+
+    monkeypatch.setattr(atexit, "register", slow)
+    port = free_port()
+    making = threading.Thread(target=lambda: pages.append(Served(port)))
+    making.start()
+    client = connected(port)
+    came.set()
+    making.join()
+    assert client.read(10.0, lambda: client.find("Act") is not None)
+    client.close()
+    pages[0].server.stop()
+
+
+def connected(port: int) -> RawClient:
+    """As soon as the port takes connections."""
+    for _ in range(500):
+        try:
+            return RawClient(f"http://127.0.0.1:{port}")
+        except OSError:
+            time.sleep(0.01)
+    raise AssertionError(f"nobody listens on {port}")
 
 
 def slide(client: RawClient, page: Served, value: object) -> None:
