@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,9 +38,10 @@ class Improvement:
     """Per episode, where the collector retries (paper: 3 for some tasks)."""
     critic_iterations: int = 2_000
     policy_iterations: int = 1_000
-    reward: RewardKind = "shaped"
-    backup: int = 8
-    """Ticks of reward in Q's target (the paper: 1); as the critic was trained."""
+    reward: RewardKind | None = None
+    """As the critic was trained by default (`of_critic`)."""
+    backup: int | None = None
+    """Ticks of reward in Q's target (the paper: 1); as the critic was trained by default."""
     evaluate_every: int = 5
     """Epochs; the policy alone, without retry or noise."""
     evaluation_scenes: int = 50
@@ -50,8 +51,16 @@ class Improvement:
         for name in ("epochs", "episodes", "attempts", "evaluate_every", "evaluation_scenes"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} is {getattr(self, name)}, must be at least 1")
+        if self.backup is not None and self.backup < 1:
+            raise ConfigError(f"backup is {self.backup}, must be at least 1 tick")
         if self.noise < 0:
             raise ConfigError(f"noise is {self.noise}, must be at least 0")
+
+    def of_critic(self, card: Mapping[str, Any]) -> Improvement:
+        """With what was left to the critic's card; what that does not tell is as far_app/checkpoints has it."""
+        training = card.get("training", {})
+        reward, backup = training.get("reward", "shaped"), training.get("backup", 8)
+        return replace(self, reward=self.reward or reward, backup=self.backup or backup)
 
     def scenes(self, epoch: int) -> range:
         """What an epoch (1-based) collects from."""

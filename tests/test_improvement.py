@@ -37,6 +37,17 @@ def test_no_epoch_collects_where_another_did_or_where_policies_are_judged():
         Improvement(episodes=0)
 
 
+def test_the_critic_goes_on_under_the_target_and_reward_it_was_trained_with():
+    card = {"training": {"reward": "sparse", "backup": 24}}
+    known, unknown = Improvement().of_critic(card), Improvement().of_critic({})
+    assert (known.reward, known.backup) == ("sparse", 24)
+    assert (unknown.reward, unknown.backup) == ("shaped", 8)
+    told = Improvement(reward="real", backup=1).of_critic(card)
+    assert (told.reward, told.backup) == ("real", 1), "what was asked for stays"
+    with pytest.raises(ConfigError, match="backup is 0, must be at least 1 tick"):
+        Improvement(backup=0)
+
+
 class Retrying:
     """The part of a Method that noise is added to."""
 

@@ -10,10 +10,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from tqdm import tqdm
@@ -67,6 +67,7 @@ def main(arguments: Sequence[str]) -> int:
     options = parse(ImproveOptions, arguments, "far improve")
     task = find_task(options.task, load_rig(options.rig).arm)
     policy, critic = checkpoints(task.name, options.policy, options.critic)
+    options = dataclasses.replace(options, loop=options.loop.of_critic(card_of(critic)))
     if options.sessions:
         check_sessions(options, policy)
     folder = options.out or Path("runs") / f"improve-{task.name}-{options.collector}-{options.loop.seed}"
@@ -80,6 +81,18 @@ def main(arguments: Sequence[str]) -> int:
             f"the finetuned policy is {folder / 'epoch-01' / 'policy.safetensors'}; the one it began from is untouched"
         )
     return 0
+
+
+def card_of(critic: Path) -> Mapping[str, Any]:
+    """What a critic tells of its training; nothing where it cannot be read, which whoever loads it says better."""
+    from safetensors import SafetensorError
+
+    from far_app.learning.critic_file import read_card
+
+    try:
+        return read_card(critic)
+    except (OSError, SafetensorError):
+        return {}
 
 
 def check_sessions(options: ImproveOptions, policy: Path) -> None:
@@ -232,7 +245,9 @@ def learn(
     seed = loop.seed * 1_000 + number
     return learn_from(
         policy, critic, known,
-        CriticTraining(iterations=loop.critic_iterations, reward=loop.reward, backup=loop.backup, seed=seed),
+        CriticTraining(
+            iterations=loop.critic_iterations, reward=loop.reward or "shaped", backup=loop.backup or 1, seed=seed
+        ),
         finetuning(config.preset, loop.policy_iterations, seed), folder,
     )  # fmt: skip
 
