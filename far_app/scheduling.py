@@ -7,8 +7,8 @@ Real time (SCHED_FIFO) is for what runs a moment and must not wait its turn; the
 
 The rest share the cores by niceness; a thread that runs Python beside one of the above holds its interpreter, and must
 itself not wait long for a core: the loop then waits for the interpreter as long as its holder waits for its turn. So
-the app's recorder, its telemetry and those who read for it are real time too (beside a real arm the loop's lateness at
-99 % fell to a third by that). In the hw server of a real arm STOP could be kept waiting that way: there all are
+the app's recorder, its telemetry and those who read for it are real time too: the hw server of a real arm, all of it
+real time, would keep them waiting, and the loop with them. In that server STOP could be kept waiting so: there all are
 (`real_time_from_here`).
 """
 

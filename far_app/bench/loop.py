@@ -67,6 +67,8 @@ class LoopOptions:
     def __post_init__(self) -> None:
         if self.seconds < 10:
             raise ConfigError(f"--seconds is {self.seconds:g}, must be at least 10 (an attempt each half)")
+        if not self.fake.partition(":")[2].isdigit():
+            raise ConfigError(f"--fake is '{self.fake}', must be ADDRESS:PORT with an address of loopback")
 
 
 def main(arguments: Sequence[str]) -> int:
