@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import logging
 from concurrent.futures import ThreadPoolExecutor
 
@@ -12,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from far_app.errors import ConfigError, PolicyError
-from far_app.learning.engines import ENGINES, Choice, EngineError, Entry, order_of, take
+from far_app.learning.engines import ENGINES, Choice, Engine, EngineError, Entry, order_of, take
 from far_app.learning.engines.cuda_graph import CudaGraphEngine
 from far_app.learning.engines.openvino_unet import available
 from far_app.learning.engines.reference import ReferenceEngine
@@ -29,12 +30,13 @@ HISTORY = tuple(s.observation for s in small_attempt(2).steps)
 NOISE = np.random.default_rng(0).standard_normal((1, 8, 7)).astype(np.float32)
 
 
-def policy(encoder: str = "light", seed: int = 0, norm: str = "group") -> DiffusionPolicy:
+def policy(encoder: str = "light", seed: int = 0, norm: str = "group", n_obs: int = 2) -> DiffusionPolicy:
     torch.manual_seed(seed)
     size = {"light": 16, "resnet18": 40, "none": 84}[encoder]
     config = dataclasses.replace(
         preset("state" if encoder == "none" else "quickstart", "lift"),
         encoder=encoder, image_size=size, widths=(16, 32), ddim_steps=4, norm=norm,
+        n_obs=n_obs,
     )  # fmt: skip
     network = DiffusionPolicy(config).eval().requires_grad_(False)
     for module in network.encoder.modules():  # statistics that a trained network would have
@@ -42,6 +44,12 @@ def policy(encoder: str = "light", seed: int = 0, norm: str = "group") -> Diffus
             module.running_mean.normal_(std=0.1)
             module.running_var.uniform_(0.5, 2.0)
     return network
+
+
+@functools.cache
+def resnet_engine(n_obs: int = 2) -> tuple[DiffusionPolicy, Engine]:
+    network = policy("resnet18", n_obs=n_obs)
+    return network, ENGINES["openvino"].make(network, "v", False)
 
 
 def moved(network: DiffusionPolicy, by: float = 0.05) -> DiffusionPolicy:
@@ -112,6 +120,38 @@ def test_learning_sees_what_the_policy_sees_while_it_acts(name, encoder):
         features = torch.cat([engine.plan([h], noise)[0] for h in acted])
     assert torch.allclose(learnt.result(), network.encode(seen), atol=tolerance)
     assert torch.allclose(features, network.encode(acted), atol=tolerance)
+
+
+@needs_openvino
+@settings(max_examples=8, deadline=None)
+@given(
+    n_obs=st.integers(1, 3), steps=st.lists(st.sampled_from([1, 1, 1, 0, 2]), min_size=3, max_size=8),
+    batches=st.lists(st.sampled_from([1, 1, 1, 2]), min_size=8, max_size=8),
+)  # fmt: skip
+def test_what_was_looked_at_ahead_is_what_the_next_tick_sees(n_obs, steps, batches):
+    """Whatever comes next: the next tick, the same one again, one that was skipped, several robots."""
+    network, engine = resnet_engine(n_obs)
+    frames, at = [o for (o, *_) in probe(network, 40)[0]], n_obs - 1
+    for step, batch in zip(steps, batches, strict=False):
+        at += step
+        histories = [tuple(frames[at + 17 * robot - n_obs + 1 : at + 17 * robot + 1]) for robot in range(batch)]
+        assert torch.allclose(engine.encode(histories), network.encode(histories), atol=1e-4)
+
+
+@needs_openvino
+def test_an_older_frame_is_looked_at_while_the_chain_runs(monkeypatch):
+    network, engine = resnet_engine()
+    look, waited = engine.frames.camera_features, []
+    monkeypatch.setattr(
+        engine.frames, "camera_features", lambda looks: waited.extend(place for _, place, _ in looks) or look(looks)
+    )
+    frames, waits = [o for (o, *_) in probe(network, 8)[0]], []
+    for at in (1, 2, 3, 4, 6, 7):
+        waited.clear()
+        engine.encode([tuple(frames[at - 1 : at + 1])])
+        waits.append(sorted(waited))
+    cold, ahead = [0, 0, 1, 1], [1, 1]
+    assert waits == [cold, cold, ahead, ahead, cold, cold]
 
 
 @needs_cuda

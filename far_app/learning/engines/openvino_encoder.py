@@ -7,7 +7,7 @@ OpenVINO 2026.4's own GroupNormalization takes the process down when a residual 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,7 +48,7 @@ class OpenVinoCameras:
         self._requests, self._shared, self._together = requests, shared, together
 
     def __call__(self, looks: Sequence[Look]) -> list[Float[Tensor, "B D"]]:
-        requests = [self._requests[camera, 0 if self._shared else place] for camera, place, _ in looks]
+        requests = self._of(looks)
         rows = []
         for pictures in zip(*(images.numpy() for _, _, images in looks), strict=True):
             for (request, pixels), picture in zip(requests, pictures, strict=True):
@@ -57,11 +57,26 @@ class OpenVinoCameras:
                     request.start_async()
                 else:
                     request.infer()
-            if self._together:
-                for request, _ in requests:
-                    request.wait()
-            rows.append([request.get_output_tensor(0).data.copy() for request, _ in requests])
+            rows.append(_results(requests, wait=self._together))
         return [torch.from_numpy(np.concatenate(look)) for look in zip(*rows, strict=True)]
+
+    def begin(self, looks: Sequence[Look]) -> Callable[[], list[Float[Tensor, "1 D"]]]:
+        """far_app.learning.engines.stepwise.Begin, of one picture each, on threads of OpenVINO's own."""
+        requests = self._of(looks)
+        for (request, pixels), (_, _, images) in zip(requests, looks, strict=True):
+            pixels[:] = images.numpy()
+            request.start_async()
+        return lambda: [torch.from_numpy(row) for row in _results(requests, wait=True)]
+
+    def _of(self, looks: Sequence[Look]) -> list[tuple[Any, np.ndarray]]:
+        return [self._requests[camera, 0 if self._shared else place] for camera, place, _ in looks]
+
+
+def _results(requests: Sequence[tuple[Any, np.ndarray]], wait: bool) -> list[np.ndarray]:
+    if wait:
+        for request, _ in requests:
+            request.wait()
+    return [request.get_output_tensor(0).data.copy() for request, _ in requests]
 
 
 def _request(compiled: Any, size: int) -> tuple[Any, np.ndarray]:

@@ -30,7 +30,9 @@ def make(
     try:
         together = worth_sharing(network) and not each_alone
         cameras = CompiledCameras(network.encoder, network.config.image_size, precision)
-        frames = Frames(network, cameras.looking(together), each_alone, another=cameras.looking)
+        looking = cameras.looking(together)
+        begin = looking.begin if together else None
+        frames = Frames(network, looking, each_alone, another=cameras.looking, begin=begin)
         return StepwiseEngine(name, network, version, frames, chain)
     except (ImportError, RuntimeError) as error:
         raise EngineError(f"OpenVINO could not build it: {error}") from error

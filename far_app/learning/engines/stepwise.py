@@ -1,7 +1,8 @@
 """An engine made of two parts: camera features frame by frame, and the chain of denoising steps.
 
 An observation's camera features are computed once where the encoder shares its weights over the frames: the next tick
-finds the previous frame's already there.
+finds the previous frame's already there. Where every place in the history has a network of its own, a picture is looked
+at again as the next tick's previous frame: begun while the chain runs, so that the next tick need not wait for it.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ Look = tuple[str, int, UInt8[Tensor, "B S S 3"]]
 """A camera, a place in the history (0 oldest), and the pictures there."""
 CameraFeatures = Callable[[Sequence[Look]], Sequence[Float[Tensor, "B D"]]]
 """Of each look; no two of them are of the same camera and place."""
+Begin = Callable[[Sequence[Look]], Callable[[], Sequence[Float[Tensor, "B D"]]]]
+"""The same in the background: what it gives waits for the features."""
 
 
 def one_by_one(features: Callable[[str, int, UInt8[Tensor, "B S S 3"]], Float[Tensor, "B D"]]) -> CameraFeatures:
@@ -51,12 +54,16 @@ class Frames:
 
     def __init__(
         self, network: DiffusionPolicy, camera_features: CameraFeatures, each_alone: bool,
-        another: Callable[[], CameraFeatures] | None = None,
+        another: Callable[[], CameraFeatures] | None = None, begin: Begin | None = None,
     ) -> None:  # fmt: skip
-        """`another`: the same function for another thread; itself where it is for any number of them."""
+        """`another`: the same function for another thread; itself where it is for any number of them. `begin`: look
+        ahead with it."""
         self.network, self.camera_features, self.each_alone = network, camera_features, each_alone
         self._another = another or (lambda: camera_features)
         self._kept = FeatureMemory(KEPT_FRAMES)
+        self._begin = begin if network.encoder.per_frame else None
+        self._begun: tuple[list[tuple[int, Observation]], Callable[[], Sequence[Float[Tensor, "1 D"]]]] | None = None
+        self._newest: Observation | None = None
 
     def features(self, histories: Sequence[History]) -> Float[Tensor, "B F"]:
         network = self.network
@@ -65,11 +72,13 @@ class Frames:
         if not network.config.cameras:
             return network.encoder.join([[] for _ in places], state)
         if network.encoder.per_frame:
-            seen = self._cameras([[h[t] for h in histories] for t in places])
+            self._finish()
+            seen = [self._at_place([h[t] for h in histories], t) for t in places]
+            self._look_ahead(histories)
         else:
             frames = [h[t] for t in places for h in histories]
             self._kept.room_for(2 * len(frames))
-            known = self._kept.of([(o,) for o in frames], lambda new: self._cameras([[o for (o,) in new]])[0])
+            known = self._kept.of([(o,) for o in frames], lambda new: self._cameras([o for (o,) in new], 0))
             seen = known.split(len(histories))
         each = [list(s.split(network.encoder.frame_dim, dim=1)) for s in seen]
         return network.encoder.join(each, state)
@@ -78,19 +87,47 @@ class Frames:
         """The same for another thread."""
         return Frames(self.network, self._another(), self.each_alone)
 
-    def _cameras(self, observations: Sequence[Sequence[Observation]]) -> list[Float[Tensor, "B C*D"]]:
-        """All cameras' features, side by side, of the observations at each place in the history."""
-        count, cameras = len(observations[0]), self.network.config.cameras
-        size = 1 if self.each_alone else count
+    def _at_place(self, observations: Sequence[Observation], place: int) -> Float[Tensor, "B C*D"]:
+        """All cameras' features by the networks of a place in the history."""
+        self._kept.room_for(2 * self.network.config.n_obs * len(observations))
+        return self._kept.of(
+            [(o,) for o in observations], lambda new: self._cameras([o for (o,) in new], place), eyes=str(place)
+        )
+
+    def _look_ahead(self, histories: Sequence[History]) -> None:
+        """Begin on this history's frames as the next tick's older ones. Not where plans are further apart than a tick
+        or made for several robots at once: no history, or no idle core, would wait for it."""
+        newest, before = histories[0][-1], self._newest
+        self._newest = newest
+        if self._begin is None or len(histories) > 1 or before is not histories[0][-2:][0]:
+            return
+        frames = list(enumerate(histories[0][1:]))
+        self._begun = frames, self._begin([look for place, frame in frames for look in self._looks([frame], place)])
+
+    def _finish(self) -> None:
+        """Keep what was begun; its networks are free again then."""
+        if self._begun is None:
+            return
+        (frames, wait), self._begun = self._begun, None
+        found, cameras = wait(), len(self.network.config.cameras)
+        for i, (place, frame) in enumerate(frames):
+            row = torch.cat([*found[i * cameras : (i + 1) * cameras]], dim=1)
+            self._kept.keep([(frame,)], row, eyes=str(place))
+
+    def _cameras(self, observations: Sequence[Observation], place: int) -> Float[Tensor, "B C*D"]:
+        """All cameras' features, side by side."""
+        size = 1 if self.each_alone else len(observations)
+        return torch.cat([
+            torch.cat([*self.camera_features(self._looks(observations[first : first + size], place))], dim=1)
+            for first in range(0, len(observations), size)
+        ])  # fmt: skip
+
+    def _looks(self, observations: Sequence[Observation], place: int) -> list[Look]:
         device = self.network.normalizer.low.device
-        rows = []
-        for first in range(0, count, size):
-            found = self.camera_features([
-                (c, place, torch.from_numpy(np.stack([o.images[c] for o in there[first : first + size]])).to(device))
-                for place, there in enumerate(observations) for c in cameras
-            ])  # fmt: skip
-            rows.append([torch.cat([*found[i : i + len(cameras)]], dim=1) for i in range(0, len(found), len(cameras))])
-        return [torch.cat(there) for there in zip(*rows, strict=True)]
+        return [
+            (c, place, torch.from_numpy(np.stack([o.images[c] for o in observations])).to(device))
+            for c in self.network.config.cameras
+        ]
 
 
 class StepwiseEngine:
