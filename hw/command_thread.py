@@ -31,6 +31,8 @@ PATIENCE_MS = 50
 """Longest wait for a message before looking whether to close."""
 BUSY_MS = 2
 """The same while a scene reset is under way."""
+EARLIEST = 0.02
+"""Seconds that a target waits for its moment at most; one that claims to be earlier still is taken at once."""
 
 
 class CommandThread:
@@ -46,6 +48,8 @@ class CommandThread:
         self._lease = Lease()
         self._closing = False
         self._pending: list[tuple[Future[None], list[bytes]]] = []
+        self._early: Target | None = None
+        """Came before its moment, which it waits for."""
         self.damaged = 0
         """Messages that could not be read or do not belong here."""
         self._bound = threading.Event()
@@ -73,7 +77,7 @@ class CommandThread:
             poller.register(socket, zmq.POLLIN)
         self._bound.set()
         while not self._closing:
-            ready = dict(poller.poll(BUSY_MS if self._pending else PATIENCE_MS))
+            ready = dict(poller.poll(self._patience()))
             if self._commands in ready:
                 self._serve(self._commands.recv_multipart())
             if station in ready:
@@ -81,6 +85,7 @@ class CommandThread:
             if geometry in ready:
                 self._answer_geometry(geometry)
             self._finish_resets()
+            self._admit_in_time()
         for socket in (self._commands, geometry, station):
             socket.close()
 
@@ -110,15 +115,41 @@ class CommandThread:
         else:
             self._damaged(f"a {type(message).__name__} in {len(parts) - 1} parts does not belong here", parts)
 
+    def _patience(self) -> int:
+        """Milliseconds, whole ones: the rest of a target's time is slept away."""
+        longest = BUSY_MS if self._pending else PATIENCE_MS
+        return longest if self._early is None else min(longest, max(0, int(1e3 * self._remaining(self._early))))
+
+    @staticmethod
+    def _remaining(target: Target) -> float:
+        return target.due - time.monotonic()
+
     def _take(self, target: Target, now: float) -> None:
-        with self._servo.locked() as controller:
-            controller.offer(target, now)
-        self._publisher.wake()
-        lead = self._publisher.lead(target.due)
-        if math.isfinite(lead):
+        """At its moment, so that the arm gets one target a tick however the app's work varies."""
+        self._admit()
+        self._early = target
+        if not 0.0 < target.due - now <= EARLIEST:
+            self._admit()
+        lead = self._publisher.lead(min(target.due, now))
+        if math.isfinite(target.due) and math.isfinite(lead):
             self._servo.shift_pictures(self._timing.shift(lead))
 
+    def _admit_in_time(self) -> None:
+        """The target that waits, if its moment comes within what a poll can tell."""
+        if self._early is not None and (remaining := self._remaining(self._early)) < 1e-3:
+            time.sleep(max(0.0, remaining))
+            self._admit()
+
+    def _admit(self) -> None:
+        if self._early is not None:
+            target, self._early = self._early, None
+            with self._servo.locked() as controller:
+                controller.offer(target, time.monotonic())
+            self._publisher.wake()
+
     def _request(self, address: list[bytes], request: Home | Hold | Resume | Heartbeat | Reset | Guide) -> None:
+        if not (isinstance(request, Hold) and request.latch):
+            self._admit()  # it came first; a STOP outruns it, and it is refused
         if isinstance(request, Reset):
             self._pending.append((self._servo.reset(request.seed), address))
             return

@@ -1,8 +1,8 @@
 """When to take the snapshot, so that its pictures reach the app just before the tick that uses them.
 
 The app's ticks and the servo ticks run on clocks of their own. The lead of a tick is the time from the pictures'
-publication to the tick's deadline; its target carries the deadline. A long lead is age that the policy need not bear, a
-negative one means the tick before's pictures. Pure; fed by the command thread, obeyed by the servo thread.
+publication to its target's coming, or to its deadline where it is late. A long lead is age that the policy need not
+bear, a negative one means the tick before's pictures. Pure; fed by the command thread, obeyed by the servo thread.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 WINDOW = 15
 """Ticks looked at before a shift: half a second."""
 LEAST = 0.004
-"""Seconds of lead kept for a picture that takes longer than most, and because a tick begins before its deadline."""
+"""Seconds of lead kept for a picture that takes longer than most, and because a tick begins before its target comes."""
 SLACK = 0.001
 """Seconds beyond a servo period before a later snapshot is worth it."""
 MISSES = 0.1

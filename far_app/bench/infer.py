@@ -1,6 +1,7 @@
 """`far bench infer`: milliseconds per chunk, encoder and critic included, by preset and engine; and how they grow.
 
-Random weights: only the architecture counts. Every call sees a new observation, as every tick does. The engines of a
+Random weights: only the architecture counts. Every call sees a new observation after the last one, as every tick does
+(what an engine has begun for the next tick, it goes on with while the others have their turns). The engines of a
 preset take turns, call by call, so that whatever else the machine does falls on all alike; `speedup` is against
 `torch`, the plain form, in the same run. `replans` is how many ticks of 30 Hz a chunk takes, its 99th percentile.
 """

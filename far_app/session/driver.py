@@ -90,6 +90,8 @@ class Driver:
     def _pass_tick(self, tick: Tick) -> float:
         """Bookkeeping of the last tick, then wait for this one's deadline and attend to what happened."""
         timeline = self.statistics.timeline
+        if tick.phase == "attempt":
+            self.clock.sent()
         self.planner.go()
         timeline.lap(AGGREGATE)
         if tick.step is not None and tick.step.tick == self.recorded:

@@ -30,8 +30,8 @@ class ShadowRobot:
 
     def send(self, target: Target) -> None:
         self._acks.append(Ack(
-            seq=target.seq, accepted=time.monotonic(), due=target.due, pose=target.pose, gripper=target.gripper,
-            refused=WITHHELD,
+            seq=target.seq, accepted=max(time.monotonic(), target.due), due=target.due, pose=target.pose,
+            gripper=target.gripper, refused=WITHHELD,
         ))  # fmt: skip
 
     def request(self, request: Request) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import threading
 import time
@@ -15,12 +16,18 @@ import zmq
 
 from far_app.endpoints import Endpoints
 from far_app.errors import RobotError
+from far_app.link import RemoteRobot
+from far_app.protocols import Hold
+from far_app.station import Station
 from far_app.tasks import task
 from far_app.telemetry import SceneGeometry
-from far_app.types import Pose, RobotMode, RobotStatus
+from far_app.types import Ack, Pose, RobotMode, RobotStatus, Target
 from hw.camera_thread import CameraThread, Pictures
+from hw.command_thread import CommandThread
 from hw.controller import ArmController
+from hw.picture_timing import PictureTiming
 from hw.plant import Measured
+from hw.publisher_thread import PublisherThread
 from hw.rig import load_rig
 from hw.servo_thread import ServoThread
 
@@ -169,3 +176,82 @@ def test_a_lost_camera_is_a_fault_in_its_own_words(servo: ServoThread) -> None:
     assert set(pictures[-1].images) == set(TASK.cameras)
     cameras.close()
     context.destroy(linger=0)
+
+
+@pytest.fixture
+def line(servo: ServoThread) -> Iterator[RemoteRobot]:
+    """To the servo thread, by way of the threads that serve it."""
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    endpoints = Endpoints.in_folder(Path(tempfile.mkdtemp(prefix="far-hw-")))
+    publisher = PublisherThread(servo, context, endpoints.observations, TASK.rate)
+    timing = PictureTiming(1 / 100, 1 / TASK.rate)
+    commands = CommandThread(servo, publisher, lambda: None, timing, context, endpoints, Station(rig={}, task="lift"))
+    publisher.start()
+    commands.start()
+    link = RemoteRobot(endpoints)
+    yield link
+    link.close()
+    commands.close()
+    publisher.close()
+    context.destroy(linger=0)
+
+
+def target(seq: int, early: float) -> Target:
+    pose = Pose(position=np.array(RIG.start_position), quaternion=np.array(RIG.start_quaternion))
+    now = time.monotonic()
+    return Target(seq=seq, pose=pose, gripper=-1.0, created=now, expires=now + 5.0, due=now + early)
+
+
+def acknowledged(link: RemoteRobot, count: int) -> list[Ack]:
+    deadline, acks = time.monotonic() + 5.0, []
+    while len(acks) < count and time.monotonic() < deadline:
+        acks += link.observe().acks
+        time.sleep(0.002)
+    return acks
+
+
+def test_a_target_that_comes_early_waits_for_its_moment(line: RemoteRobot) -> None:
+    for seq in range(1, 31):
+        line.send(target(seq, early=0.0015 * (seq % 10)))
+        time.sleep(0.02)
+    acks = acknowledged(line, 30)
+    assert [a.seq for a in acks] == list(range(1, 31))
+    assert not any(a.refused for a in acks)
+    assert all(a.accepted >= a.due for a in acks)
+
+
+@pytest.mark.parametrize("early", [math.nan, 3600.0])
+def test_one_without_a_moment_or_with_one_far_off_is_taken_at_once(line: RemoteRobot, early: float) -> None:
+    sent = target(1, early)
+    line.send(sent)
+    (ack,) = acknowledged(line, 1)
+    assert ack.accepted < sent.created + 1.0
+    assert not ack.refused
+
+
+def test_what_comes_after_an_early_target_finds_it_admitted(line: RemoteRobot, servo: ServoThread) -> None:
+    line.send(target(1, early=0.015))
+    line.send(target(2, early=0.015))
+    line.request(Hold(reason="enough"))
+    first, second = acknowledged(line, 2)
+    assert (first.seq, second.seq, first.refused, second.refused) == (1, 2, "", "")
+    time.sleep(0.05)
+    with servo.locked() as controller:
+        assert controller.status().mode is RobotMode.HOLD, "no target moves the arm after the hold"
+        assert controller.status().reason == "enough"
+
+
+@pytest.mark.parametrize("how", ["line", "thread"])
+def test_a_stop_outruns_a_target_that_waits(line: RemoteRobot, servo: ServoThread, how: str) -> None:
+    for seq in range(1, 11):
+        line.send(target(seq, early=0.019))
+        if seq == 10:
+            time.sleep(0.005)
+            line.request(Hold(reason="STOP", latch=True)) if how == "line" else servo.stop("STOP")
+    (*_, last) = acknowledged(line, 10)
+    assert last.seq == 10
+    assert "latched" in last.refused or last.accepted < last.due + 0.02, "a machine that stalled may have been too slow"
+    wait_for(servo, lambda s: s.mode is RobotMode.LATCHED)
+    time.sleep(0.05)
+    with servo.locked() as controller:
+        assert controller.status().mode is RobotMode.LATCHED

@@ -15,7 +15,7 @@ from far_app.motion import ActionScale
 from far_app.noise import keyed_noise
 from far_app.protocols import Planner, PlanRequest
 from far_app.session.adaptation import BackgroundAdaptation
-from far_app.session.clock import TickClock
+from far_app.session.clock import LEAST, MOST, ON_THE_WAY, TickClock
 from far_app.session.lockstep import adapt_at_once, run_lockstep
 from far_app.session.planners import LockstepPlanner, ThreadedPlanner
 from far_app.tasks import task
@@ -45,14 +45,29 @@ def test_deadlines_lie_on_one_grid_whatever_a_tick_costs(monkeypatch):
     assert clock.stalls == 0
 
 
-def test_work_begins_just_before_the_deadline_so_that_the_target_is_there_in_time(monkeypatch):
+def test_work_begins_as_early_as_the_slowest_tick_lately_needed_so_that_targets_are_there_in_time(monkeypatch):
     fake = FakeTime(monkeypatch)
-    clock = TickClock(rate=10.0, lead=0.001)
+    clock = TickClock(rate=30.0)
     clock.restart()
-    for cost in (0.02, 0.0995, 0.05):
+    clock.sent()
+    assert clock.lead == LEAST, "nothing was waited for, nothing is learnt"
+    spent = np.random.default_rng(0).exponential(0.001, 20_000) + 0.0003
+    late, leads = [], []
+    for took in spent:
         due = clock.wait()
-        assert fake.now == pytest.approx(due - 0.001, abs=1e-9)
-        fake.now += cost
+        assert fake.now == pytest.approx(due - clock.lead, abs=1e-9)
+        fake.now += took
+        late.append(fake.now + ON_THE_WAY - due)
+        clock.sent()
+        leads.append(clock.lead)
+        fake.now += 0.002
+    assert np.percentile(late, 99) < 0.0 < np.percentile(spent, 99) + ON_THE_WAY - LEAST
+    assert np.percentile(late, 99.9) < 0.0015, "with the least lead it would be 6 ms"
+    assert max(leads) == MOST, "one that took longer is late, and the next do not pay for it with older observations"
+    for _ in range(20_000):
+        clock.wait()
+        clock.sent()
+    assert clock.lead == pytest.approx(LEAST, abs=1e-6), "what is long past is forgotten"
 
 
 def test_a_stall_is_counted_and_never_followed_by_a_burst(monkeypatch):
