@@ -42,8 +42,8 @@ def local_workers(plan: Any, jobs: Sequence[Job], count: int, begin: Begin, work
     count = min(count, len(jobs))
     for job in [*jobs, *[None] * count]:
         waiting.put(job)
-    with ProcessPoolExecutor(count, context, _begin_worker, (begin, plan, work, waiting, told)) as pool:
-        pending = {pool.submit(_work) for _ in range(count)}
+    with ProcessPoolExecutor(count, context, _take_from, (waiting, told)) as pool:
+        pending = {pool.submit(_work, begin, plan, work) for _ in range(count)}
         expected = heard = 0
         while pending or heard < expected:
             with contextlib.suppress(queue.Empty):
@@ -56,22 +56,35 @@ def local_workers(plan: Any, jobs: Sequence[Job], count: int, begin: Begin, work
             except BrokenProcessPool as error:
                 raise FarError("a worker was killed; every finished episode is kept: start again to go on") from error
             except BaseException:
+                _give_out_no_more(waiting, count)
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
 
 
+def _give_out_no_more(waiting: Any, count: int) -> None:
+    """The other workers end with what they have."""
+    with contextlib.suppress(queue.Empty):
+        while True:
+            waiting.get(timeout=0.1)
+    for _ in range(count):
+        waiting.put(None)
+
+
 _TAKE: dict[str, Any] = {}
+"""In a worker: the queues of scenes and of records, and whether it was begun."""
 
 
-def _begin_worker(begin: Begin, plan: Any, work: Work, waiting: Any, told: Any) -> None:
-    begin(plan)
-    _TAKE.update(work=work, waiting=waiting, told=told)
+def _take_from(waiting: Any, told: Any) -> None:
+    _TAKE.update(waiting=waiting, told=told)
 
 
-def _work() -> int:
+def _work(begin: Begin, plan: Any, work: Work) -> int:
     """In a worker: scenes from the queue until its end, each record to the one who asked as soon as it is there."""
+    if "begun" not in _TAKE:
+        begin(plan)
+        _TAKE["begun"] = True
     count = 0
-    for record in _TAKE["work"](iter(_TAKE["waiting"].get, None)):
+    for record in work(iter(_TAKE["waiting"].get, None)):
         _TAKE["told"].put(record)
         count += 1
     return count

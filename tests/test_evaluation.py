@@ -9,6 +9,8 @@ import time
 
 import pytest
 
+from far_app.cli.evaluate import main as evaluate_command
+from far_app.cli.study import main as study_command
 from far_app.config import FCPAConfig, RetryConfig
 from far_app.errors import ConfigError, FarError
 from far_app.evaluation import Arm, EvaluationPlan, differences, evaluate, read_arms_file, read_results, run_scenes
@@ -76,6 +78,42 @@ def test_two_workers_find_the_same_and_a_killed_one_costs_no_finished_episode(tm
     evaluate(tmp_path, PLAN, 2, lambda record: None, begin, work)
     found = sorted((r["scene"], r["arm"]) for r in read_results(tmp_path / "episodes.jsonl"))
     assert found == sorted((s, a) for s in (100, 101, 102) for a in ("nr", "far")), "nothing lost, nothing twice"
+
+
+def begin_without_a_policy(plan):
+    raise ConfigError(f"no policy at {plan.policy}; train one first")
+
+
+def fails_in_scene_100(block):
+    for record in work(block):
+        if record["scene"] == 100:
+            raise FarError("scene 100 cannot be drawn")
+        time.sleep(0.2)
+        yield record
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize(
+    "begin_, work_, why",
+    [(begin_without_a_policy, work, "no policy at p"), (begin, fails_in_scene_100, "scene 100 cannot be drawn")],
+)
+def test_what_a_worker_cannot_do_is_told_in_its_own_words(tmp_path, begin_, work_, why, workers):
+    plan = dataclasses.replace(PLAN, scenes=500)
+    with pytest.raises(FarError, match=why):
+        evaluate(tmp_path, plan, workers, lambda record: None, begin_, work_)
+    assert len(read_results(tmp_path / "episodes.jsonl")) < 500, "the others do not go on to the end"
+
+
+def test_an_unknown_method_is_refused_before_anything_is_made(tmp_path):
+    study = tmp_path / "s.toml"
+    study.write_text(
+        'rig = "panda"\npreset = "state"\nseeds = [0]\nscenes = 1\nmax_attempts = 2\n[[task]]\nname = "lift"\n'
+        'demonstrations = 1\niterations = 1\n[[arm]]\nname = "mine"\nmethod = "nope"\n'
+    )
+    for command, words in ((evaluate_command, ["--methods", "nope"]), (study_command, [str(study)])):
+        with pytest.raises(ConfigError, match="unknown method 'nope'; choose one of: dp, nr"):
+            command([*words, "--out", str(tmp_path / "out")])
+        assert not (tmp_path / "out").exists()
 
 
 def test_results_of_another_plan_are_refused(tmp_path):

@@ -97,6 +97,14 @@ def assemble(
     return equip(load_model(policy, critic, task.name, device, [method], engine, lanes, threads), method, retry)
 
 
+def check_methods(methods: Sequence[str]) -> None:
+    """ConfigError for a name that is no method's."""
+    from far_app.methods import METHODS
+
+    if unknown := [m for m in methods if m not in METHODS]:
+        raise ConfigError(f"unknown method '{unknown[0]}'; choose one of: {', '.join(METHODS)}")
+
+
 def load_model(
     policy: str | None,
     critic: Path | None,
@@ -114,8 +122,7 @@ def load_model(
     from far_app.methods import METHODS
     from far_app.methods.retry import BASE_VERSION
 
-    if unknown := [m for m in methods if m not in METHODS]:
-        raise ConfigError(f"unknown method '{unknown[0]}'; choose one of: {', '.join(METHODS)}")
+    check_methods(methods)
     check_device(device)
     if policy is not None and policy.startswith(UNTRAINED):
         name, beside = policy, None

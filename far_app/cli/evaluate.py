@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from tqdm import tqdm
 
-from far_app.cli.assemble import checkpoints, equip, load_model
+from far_app.cli.assemble import check_methods, checkpoints, equip, load_model
 from far_app.cli.lockstep_twin import LANES, lockstep_twins, side_by_side
 from far_app.cli.settings import Settings, parse
 from far_app.config import RetryConfig
@@ -77,6 +77,7 @@ def main(arguments: Sequence[str]) -> int:
         first_scene=first, scenes=options.scenes,
         max_attempts=options.attempts,
     )  # fmt: skip
+    check_methods([arm.method for arm in plan.arms])
     if options.address is not None and options.engine != "ray":
         raise ConfigError(f"--address {options.address} was given without --engine ray")
     run = ray_workers(options.address) if options.engine == "ray" else local_workers

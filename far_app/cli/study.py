@@ -15,6 +15,7 @@ from pathlib import Path
 
 import tyro
 
+from far_app.cli.assemble import check_methods
 from far_app.cli.evaluate import run_plan
 from far_app.cli.report import write_report
 from far_app.errors import FarError
@@ -37,6 +38,7 @@ class StudyOptions:
 def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(StudyOptions, args=list(arguments), prog="far study")
     study = read_study(options.study)
+    check_methods([arm.method for arm in study.arms])
     folder = options.out or Path("runs") / options.study.stem
     make_models(study, folder, options.workers)
     for task, seed in study.models:
