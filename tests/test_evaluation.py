@@ -116,6 +116,15 @@ def test_an_unknown_method_is_refused_before_anything_is_made(tmp_path):
         assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
+def test_the_policy_alone_has_one_attempt_beside_methods_that_retry(tmp_path):
+    """Scene 20001: the shipped model does not solve it at once."""
+    evaluate_command(["--methods", "dp", "nr", "--scenes", "1", "--first-scene", "20001", "--attempts", "2",
+                      "--workers", "1", "--out", str(tmp_path / "out")])  # fmt: skip
+    attempts = {r["arm"]: r["attempts"] for r in read_results(tmp_path / "out" / "episodes.jsonl")}
+    assert attempts == {"dp": 1, "nr": 2}
+
+
 def test_results_of_another_plan_are_refused(tmp_path):
     evaluate(tmp_path, PLAN, 1, lambda record: None, begin, work)
     with pytest.raises(ConfigError, match="another plan"):

@@ -128,7 +128,8 @@ def begin(plan: EvaluationPlan) -> None:
     images = any(p.method.policy.spec.cameras for p in parts.values())
     robots = lockstep_twins(plan.rig, task, min(LANES, plan.scenes), images)
     methods = {name: [p.another() for _ in robots] for name, p in parts.items()}
-    _WORKER.update(task=task, robots=robots, methods=methods)
+    attempts = {name: p.max_attempts for name, p in parts.items()}
+    _WORKER.update(task=task, robots=robots, methods=methods, attempts=attempts)
 
 
 def work(jobs: Iterable[Job]) -> Iterator[dict[str, Any]]:
@@ -138,7 +139,8 @@ def work(jobs: Iterable[Job]) -> Iterator[dict[str, Any]]:
 
 def run_episodes(take: Callable[[], Episode | None]) -> Iterator[tuple[Episode, Trial]]:
     """Trials of scenes under arms, side by side on this worker's twins."""
-    methods = _WORKER["methods"]
+    methods, attempts = _WORKER["methods"], _WORKER["attempts"]
     return side_by_side(
-        take, _WORKER["robots"], lambda episode, lane: (episode[1], methods[episode[0]][lane]), _WORKER["task"]
-    )
+        take, _WORKER["robots"], lambda episode, lane: (episode[1], methods[episode[0]][lane]), _WORKER["task"],
+        attempts=lambda episode: attempts[episode[0]],
+    )  # fmt: skip

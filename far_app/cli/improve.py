@@ -243,11 +243,10 @@ def learn(
         succeeded=[e for e in collected if e.success], failed=[e for e in collected if not e.success],
     )  # fmt: skip
     seed = loop.seed * 1_000 + number
+    assert loop.reward is not None and loop.backup is not None, "of_critic has filled them"
     return learn_from(
         policy, critic, known,
-        CriticTraining(
-            iterations=loop.critic_iterations, reward=loop.reward or "shaped", backup=loop.backup or 1, seed=seed
-        ),
+        CriticTraining(iterations=loop.critic_iterations, reward=loop.reward, backup=loop.backup, seed=seed),
         finetuning(config.preset, loop.policy_iterations, seed), folder,
     )  # fmt: skip
 

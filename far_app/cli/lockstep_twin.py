@@ -74,9 +74,10 @@ def side_by_side(
     cast: Callable[[J, int], tuple[int, Method]],
     task: TaskConfig,
     alarms: Sequence[Alarm] = (),
+    attempts: Callable[[J], int | None] = lambda job: None,
 ) -> Iterator[tuple[J, Trial]]:
     """Trials of whatever `take` hands out; `cast` names the scene of a job and its method on a lane; an alarm for each
-    robot, or none."""
+    robot, or none; `attempts` of a job's trial where they are not the task's."""
     from far_app.attempt import NO_ALARM, Setting
     from far_app.detectors import TwinCheck
     from far_app.session.lockstep import Lane, adapt_at_once, run_together
@@ -88,7 +89,8 @@ def side_by_side(
         robot.request(Resume())
         scene, method = cast(job, lane)
         setting = Setting(
-            robot=robot, planner=LockstepPlanner(), detector=TwinCheck(task.success_ticks), task=task,
+            robot=robot, planner=LockstepPlanner(), detector=TwinCheck(task.success_ticks),
+            task=dataclasses.replace(task, max_attempts=attempts(job) or task.max_attempts),
             scale=robot.scale, alarm=alarms[lane] if alarms else NO_ALARM,
         )  # fmt: skip
         return Lane(trial(scene, method, setting, adapt_at_once), robot.advance, robot.free)

@@ -97,9 +97,9 @@ class Frames:
     def _look_ahead(self, histories: Sequence[History]) -> None:
         """Begin on this history's frames as the next tick's older ones. Not where plans are further apart than a tick
         or made for several robots at once: no history, or no idle core, would wait for it."""
-        newest, before = histories[0][-1], self._newest
+        (*older, newest), before = histories[0], self._newest
         self._newest = newest
-        if self._begin is None or len(histories) > 1 or before is not histories[0][-2:][0]:
+        if self._begin is None or len(histories) > 1 or not older or older[-1] is not before:
             return
         frames = list(enumerate(histories[0][1:]))
         self._begun = frames, self._begin([look for place, frame in frames for look in self._looks([frame], place)])
