@@ -16,7 +16,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 
 import mujoco
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from far_app.errors import GraphicsError
 from far_app.motion import quat_inverse, quat_multiply
@@ -24,6 +24,11 @@ from far_app.telemetry import BodyMesh, SceneGeometry
 from far_app.types import Pose
 from hw.solids import box, cylinder
 from hw.thin_meshes import FACE_BUDGET, thin_meshes
+
+VISUAL, HIDDEN = 1, 5
+"""Geom groups: robosuite's of what is drawn, and one that never is."""
+WITHOUT = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_SKYBOX)
+"""What is not drawn. The sky: walls hide it, but every pixel of it would be drawn before them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,8 +88,9 @@ class TwinView:
         self._drawn: Any = None
         self._options = mujoco.MjvOption()
         self._options.geomgroup[:] = 0
-        self._options.geomgroup[1] = 1
+        self._options.geomgroup[VISUAL] = 1
         self._options.sitegroup[:] = 0
+        self._visual = self._model.geom_group == VISUAL
 
     @property
     def faces(self) -> int:
@@ -100,7 +106,7 @@ class TwinView:
                     f"no {os.environ.get('MUJOCO_GL', 'egl')} context of {size}×{size} could be made ({error}); "
                     "install libegl1 and libgl1-mesa-dri (Debian), or set MUJOCO_GL=osmesa with libosmesa6"
                 ) from error
-            for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            for flag in WITHOUT:
                 renderer.scene.flags[flag] = 0
             self._renderers[size] = renderer
         return self._renderers[size]
@@ -116,9 +122,20 @@ class TwinView:
 
     def image(self, snapshot: Any, camera: str, size: int) -> UInt8[np.ndarray, "size size 3"]:
         self._place(snapshot)
+        self._model.geom_group[self._visual] = np.where(self._in_sight(camera), VISUAL, HIDDEN)
         renderer = self._renderer(size)
         renderer.update_scene(self._data, camera, scene_option=self._options)
         return renderer.render()
+
+    def _in_sight(self, camera: str) -> Bool[np.ndarray, "V"]:
+        """Which of the visual geoms may be in a camera's (square) picture, by their bounding spheres. The wrist's
+        camera has most of the arm behind it, and software draws what it then throws away."""
+        model, data, i = self._model, self._data, self._model.camera(camera).id
+        radius = model.geom_rbound[self._visual]
+        seen = (data.geom_xpos[self._visual] - data.cam_xpos[i]) @ data.cam_xmat[i].reshape(3, 3)
+        half = np.deg2rad(model.cam_fovy[i]) / 2
+        beside = np.abs(seen[:, :2]) * np.cos(half) + seen[:, 2:] * np.sin(half)  # of the planes at the picture's edges
+        return (radius == 0) | ((beside.max(axis=1) < radius) & (seen[:, 2] < radius))  # 0: a plane's, without end
 
     def body_poses(self, snapshot: Any) -> Float[np.ndarray, "B 7"]:
         self._place(snapshot)
@@ -139,7 +156,7 @@ class TwinView:
         """A visual geom as a triangle mesh in its body's frame; floor and walls are left out."""
         model = self._model
         kind, size = model.geom_type[geom], model.geom_size[geom]
-        if model.geom_group[geom] != 1:
+        if not self._visual[geom]:
             return None
         if kind == mujoco.mjtGeom.mjGEOM_MESH:
             mesh = model.geom_dataid[geom]

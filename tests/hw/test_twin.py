@@ -1,5 +1,6 @@
 """The twin itself: exact time, seeded scenes, a solvable task, pictures that show it."""
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -163,3 +164,27 @@ def test_cameras_look_at_their_targets(plant):
         forward = -matrix.reshape(3, 3)[:, 2]
         wanted = np.subtract(camera.target, camera.position)
         assert forward == pytest.approx(wanted / np.linalg.norm(wanted))
+
+
+@pytest.mark.parametrize("rig,name", [("twin", "lift"), ("twin", "door"), ("panda", "can"), ("panda", "square")])
+def test_what_is_left_out_of_a_drawing_is_not_to_be_seen_in_it(rig, name, monkeypatch):
+    """Geoms beside and behind a camera, and the sky: pictures without them are the same to the last grey level."""
+    rig = load_rig(rig, name)
+    plant = TwinPlant(rig, task(name, rig.arm))
+    view = TwinView(plant.model_xml(), plant.base_pose(), plant.cameras())
+    left_out = 0
+    for seed in range(3):
+        plant.reset(seed)
+        for _ in range(30 * seed):
+            plant.servo(plant.measure().eef, 1.0)
+            plant.advance()
+        for camera in plant.cameras():
+            picture = view.image(plant.snapshot(), camera, 84)
+            left_out += int((~view._in_sight(camera)).sum())
+            with monkeypatch.context() as patched:
+                patched.setattr(TwinView, "_in_sight", lambda self, camera: np.ones(self._visual.sum(), bool))
+                view._renderer(84).scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 1
+                assert np.array_equal(view.image(plant.snapshot(), camera, 84), picture)
+                view._renderer(84).scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 0
+    view.close()
+    assert left_out > 10
