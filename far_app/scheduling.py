@@ -43,8 +43,17 @@ SWITCH_INTERVAL = 1e-4
 KEEP_INTERVAL = 1e-3
 """The same between a tick's deadline and its target: the loop's few lines are not to be taken apart by others."""
 
+MOST_LEARNING = 4
+"""Threads that learn at once where there are many cores: an update is rarely cut into more pieces."""
+
 _PR_SET_TIMERSLACK = 29
 _TIMER_SLACK_NS = 1000
+
+
+def learning_threads() -> int:
+    """As many as there are cores for this process, up to MOST_LEARNING: the arm needs little of them on its way home,
+    and goes first."""
+    return min(len(os.sched_getaffinity(0)), MOST_LEARNING)
 
 
 def nice(niceness: int) -> bool:

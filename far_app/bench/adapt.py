@@ -187,8 +187,8 @@ def learning(method: Method) -> RetryMethod:
 
 
 def plainly(method: RetryMethod) -> RetryMethod:
-    """The same method, its networks run as they are written."""
+    """The same method, its networks run as they are written, on one thread."""
     from far_app.learning.trainable import plain
 
-    method.arrange, method.encode = plain, method.base.encode
+    method.arrange, method.encode, method.threads = plain, method.base.encode, 1
     return method

@@ -84,9 +84,11 @@ def assemble(
     engine: str = "auto",
     lanes: int | None = None,
     threads: int = 1,
+    learning_threads: int = 1,
 ) -> Parts:
     """Load what a method needs and warm it up; `lanes`: trials that will share the base policy's batches; `threads`: of
-    one torch operation. Raises ConfigError or CheckpointError."""
+    one torch operation; `learning_threads`: that learn from a failure at once. Raises ConfigError or
+    CheckpointError."""
     if policy is not None and policy.startswith("test:"):
         from far_app.cli._scripted import ScriptedMethod
 
@@ -94,7 +96,8 @@ def assemble(
         return Parts(
             method=scripted, policy_name=policy, max_attempts=None, checkpoint=policy, another=lambda: scripted
         )
-    return equip(load_model(policy, critic, task.name, device, [method], engine, lanes, threads), method, retry)
+    model = load_model(policy, critic, task.name, device, [method], engine, lanes, threads)
+    return equip(model, method, retry, learning_threads)
 
 
 def check_methods(methods: Sequence[str]) -> None:
@@ -155,8 +158,9 @@ def engine_choice(engine: str, network: DiffusionPolicy, lanes: int | None, thre
     return fastest(network, threads) if engine == "auto" and lanes is None else order_of(engine, network)
 
 
-def equip(model: Model, method: str, retry: RetryConfig) -> Parts:
-    """One method of a loaded model, with its settings. Raises ConfigError or CheckpointError."""
+def equip(model: Model, method: str, retry: RetryConfig, learning_threads: int = 1) -> Parts:
+    """One method of a loaded model, with its settings, learning on so many threads. Raises ConfigError or
+    CheckpointError."""
     from far_app.learning.critic_file import load_demonstrations
     from far_app.methods import METHODS, Ingredients
     from far_app.methods import method as make_method
@@ -168,7 +172,7 @@ def equip(model: Model, method: str, retry: RetryConfig) -> Parts:
         retry = with_threshold(retry, model.critic_file)
     ingredients = Ingredients(
         network=model.network, critic=model.critic, config=retry, demonstrations=demonstrations, act=model.act,
-        memory=model.memory, encoder=model.base.another_encoder,
+        memory=model.memory, encoder=model.base.another_encoder, threads=learning_threads,
     )  # fmt: skip
     return Parts(
         method=make_method(method, ingredients), policy_name=model.name, max_attempts=entry.attempts,

@@ -9,6 +9,7 @@ from typing import Literal
 from far_app.cli.settings import Settings
 from far_app.config import RetryConfig
 from far_app.errors import ConfigError
+from far_app.scheduling import learning_threads
 from hw.rig import RigConfig, at_address, load_rig
 
 EngineName = Literal["auto", "torch", "arranged", "openvino", "openvino-bf16", "cuda-graph"]
@@ -70,6 +71,8 @@ class RunOptions:
     """Folder of the sessions."""
     torch_threads: int = 1
     """Threads of one torch operation in the loop's process."""
+    learning_threads: int = field(default_factory=learning_threads)
+    """Threads that learn from a failure at once; by default one for each core, up to four."""
     settings: Settings = "model"
     """Begin from what the checkpoint's makers recommend (the retry.toml beside it), or from the paper's settings."""
     retry: RetryConfig = field(default_factory=RetryConfig)
@@ -110,7 +113,7 @@ class RunOptions:
             )
 
     def __post_init__(self) -> None:
-        limits = {"trials": 0, "seed": 0, "torch_threads": 1, "max_attempts": 1}
+        limits = {"trials": 0, "seed": 0, "torch_threads": 1, "learning_threads": 1, "max_attempts": 1}
         for name, least in limits.items():
             value = getattr(self, name)
             if value is not None and value < least:

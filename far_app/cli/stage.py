@@ -158,7 +158,7 @@ def one_method(options: RunOptions, task: TaskConfig) -> Mapping[str, Parts]:
     """What the options themselves ask for."""
     parts = assemble(
         options.method, task, options.policy, options.critic, options.device, options.retry, options.engine,
-        threads=options.torch_threads,
+        threads=options.torch_threads, learning_threads=options.learning_threads,
     )  # fmt: skip
     return {options.method: parts}
 

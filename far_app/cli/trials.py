@@ -116,7 +116,7 @@ def assembled(plan: TrialPlan, options: RunOptions, task: TaskConfig) -> Mapping
             models[key] = load_model(
                 *key, task.name, options.device, sharing, options.engine, threads=options.torch_threads
             )
-        parts[method.name] = equip(models[key], method.method, retry)
+        parts[method.name] = equip(models[key], method.method, retry, options.learning_threads)
     return parts
 
 

@@ -22,11 +22,14 @@ from far_app.learning.adamw import FlatAdamW, guarded_step
 from far_app.learning.cancellation import Cancelled
 from far_app.learning.pairs import Pairs
 from far_app.learning.preference import Cloning, Demonstrations, Noising, Objective, draw
+from far_app.learning.threads import Each, in_turn
 from far_app.learning.trainable import Arrange, trainable
 from far_app.types import AdaptationStep
 
 FIXED_DRAWS = 1
 """Draws a state for the reported l⁺ and l⁻; the same before the first and after every step."""
+REPORTED = 2
+"""Positives a state in what is reported, where it is for people alone: no guard decides by it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,14 +64,15 @@ def adapt(
     progress: Callable[[AdaptationStep], None],
     demonstrations: Demonstrations | None = None,
     arrange: Arrange = trainable,
+    each: Each = in_turn,
 ) -> Update:
     """FCPA on these pairs, in place; `denoiser` is the caller's private copy of the weights that acted, in eval mode.
-    `arrange` says how it is run: the quickest way, or plainly.
+    `arrange` says how it is run, the quickest way or plainly; `each`, on how many threads.
     Progress is told before the first step (step 0) and after each. Raises AdaptationCancelledError on cancellation;
     the copy is then of no use."""
     check_config(config, demonstrations)
     runner = arrange(denoiser, pairs.negatives.shape[1])
-    objective = Objective(runner, noising, pairs, config, cancelled)
+    objective = Objective(runner, noising, pairs, config, cancelled, each)
     states = len(pairs.features)
     fixed = draw(rng, states, FIXED_DRAWS, noising.steps, pairs.negatives)
     optimiser = FlatAdamW(runner.parameters, lr=config.lr)
@@ -76,10 +80,11 @@ def adapt(
     cloning = None
     if config.guard == "bc" and demonstrations is not None:
         cloning = Cloning(demonstrations=demonstrations, weight=config.bc_weight, rng=rng)
+    decides = config.guard in {"stop", "scale"}
     history: list[AdaptationStep] = []
 
     def report(step: int) -> AdaptationStep:
-        loss, winner, loser = objective.report(fixed)
+        loss, winner, loser = objective.report(fixed, most=None if decides else REPORTED)
         if not (math.isfinite(loss) and math.isfinite(winner)):
             raise PolicyError(f"loss {loss} and l⁺ {winner} at step {step} of {config.steps}; lower fcpa.lr")
         history.append(AdaptationStep(
@@ -91,7 +96,7 @@ def adapt(
     try:
         limit = report(0).winner_error * (1 + config.guard_rise)
         for step in range(1, config.steps + 1):
-            before = optimiser.weights.clone()
+            before = optimiser.weights.clone() if decides else start
             fresh = draw(rng, states, config.draws, noising.steps, pairs.negatives)
             if config.guard == "scale":
                 guarded_step(optimiser, *objective.gradients(fresh))
@@ -99,7 +104,7 @@ def adapt(
                 optimiser.step(objective.gradient(fresh, cloning))
             runner.refresh()
             winner = report(step).winner_error
-            if config.guard in {"stop", "scale"} and winner > limit:
+            if decides and winner > limit:
                 optimiser.weights.copy_(before)
                 note = f"step {step} raised l⁺ to {winner:.3g}, above {limit:.3g}; it was undone"
                 return Update(status="stopped", changed=step > 1, history=tuple(history), note=note)

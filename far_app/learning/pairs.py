@@ -20,6 +20,7 @@ from torch import Tensor
 
 from far_app.config import PairsConfig
 from far_app.learning.cancellation import Cancelled, check
+from far_app.learning.threads import Each, in_turn
 from far_app.types import ARM_DIMS, TRANSLATION_DIMS
 
 BATCH = 128
@@ -53,12 +54,19 @@ class Pairs:
     def __len__(self) -> int:
         return len(self.positives)
 
+    def first(self, most: int) -> Int[Tensor, "P2"]:
+        """Rows of every state's first positives, `most` at most."""
+        counts = torch.bincount(self.owner, minlength=len(self.features))
+        place = torch.arange(len(self), device=self.owner.device) - (counts.cumsum(0) - counts)[self.owner]
+        return torch.nonzero(place < most)[:, 0]
+
 
 def candidates(
     sample: Sampler,
     features: Float[Tensor, "S F"],
     noise: Float[Tensor, "S M H A"],
     cancelled: Cancelled,
+    each: Each = in_turn,
 ) -> Float[Tensor, "S M H A"]:
     """M chunks from the policy for every state, in batches of BATCH across states."""
     states, per_state = noise.shape[:2]
@@ -66,11 +74,12 @@ def candidates(
         return torch.zeros_like(noise)
     flat = noise.flatten(0, 1)
     state = torch.arange(states).repeat_interleave(per_state)
-    chunks = []
-    for rows in torch.arange(len(flat)).split(BATCH):
+
+    def batch(rows: Int[Tensor, "B"]) -> Float[Tensor, "B H A"]:
         check(cancelled)
-        chunks.append(sample(features[state[rows]], flat[rows]))
-    return torch.cat(chunks).reshape(noise.shape)
+        return sample(features[state[rows]], flat[rows])
+
+    return torch.cat(each(batch, torch.arange(len(flat)).split(BATCH))).reshape(noise.shape)
 
 
 def explored(chunks: Float[Tensor, "S M H A"], sigma: float, rng: np.random.Generator) -> Float[Tensor, "S M H A"]:

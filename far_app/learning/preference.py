@@ -23,13 +23,14 @@ from torch.nn import functional
 from far_app.config import FCPAConfig
 from far_app.learning.cancellation import Cancelled, check
 from far_app.learning.pairs import Pairs
+from far_app.learning.threads import Each, in_turn
 from far_app.learning.trainable import Trainable
 from far_app.types import ARM_DIMS
 
 AddNoise = Callable[[Float[Tensor, "B H A"], Float[Tensor, "B H A"], Int[Tensor, "B"]], Float[Tensor, "B H A"]]
 """a_k from (a, ε, k)."""
 BATCH = 256
-"""Rows a pass: enough to be quick, few enough that a cancellation between two is noticed within 100 ms."""
+"""Most rows a pass: enough to be quick, few enough that a cancellation between two is noticed within 100 ms."""
 STATES_AT_ONCE = 16
 """States whose activations are kept for one backward pass; bounds memory, not the result."""
 BC_BATCH = 64
@@ -124,15 +125,13 @@ def joined(parts: Sequence[Noisy]) -> Noisy:
 
 
 def denoising_errors(
-    denoiser: Trainable, noisy: Noisy, config: FCPAConfig, cancelled: Cancelled
+    denoiser: Trainable, noisy: Noisy, config: FCPAConfig, cancelled: Cancelled, each: Each = in_turn
 ) -> list[Float[Tensor, "B"]]:
     """‖ε − ε_θ‖² of every row, summed (or averaged) over entries (the arm's alone with `arm_only`), in batches as equal
-    as may be. `per_chunk` makes l_diff of them."""
-    errors: list[Tensor] = []
-    if not len(noisy):
-        return errors
+    as may be, an even number of them. `per_chunk` makes l_diff of them."""
     dims = ARM_DIMS if config.arm_only else noisy.chunks.shape[2]
-    for rows in torch.arange(len(noisy)).tensor_split(math.ceil(len(noisy) / BATCH)):
+
+    def batch(rows: Int[Tensor, "B"]) -> Float[Tensor, "B"]:
         check(cancelled)
         here, row = noisy.state[rows].unique(return_inverse=True)
         condition = denoiser.condition(noisy.features[here]).index_select(0, row)
@@ -140,8 +139,10 @@ def denoising_errors(
         if predicted.requires_grad:
             predicted.register_hook(lambda _: check(cancelled))  # on the way back too, batch by batch
         squared = (noisy.noise[rows] - predicted)[..., :dims].square().flatten(1)
-        errors.append(squared.sum(1) if config.reduction == "sum" else squared.mean(1))
-    return errors
+        return squared.sum(1) if config.reduction == "sum" else squared.mean(1)
+
+    count = min(len(noisy), 2 * math.ceil(len(noisy) / (2 * BATCH)))
+    return each(batch, torch.arange(len(noisy)).tensor_split(count)) if count else []
 
 
 def per_chunk(errors: Float[Tensor, "N*D"], draws: int) -> Float[Tensor, "N"]:
@@ -173,10 +174,12 @@ class Objective:
     """The preference loss of one set of pairs: its value on fixed draws, its gradients on fresh ones."""
 
     def __init__(
-        self, denoiser: Trainable, noising: Noising, pairs: Pairs, config: FCPAConfig, cancelled: Cancelled
-    ) -> None:
+        self, denoiser: Trainable, noising: Noising, pairs: Pairs, config: FCPAConfig, cancelled: Cancelled,
+        each: Each = in_turn,
+    ) -> None:  # fmt: skip
+        """`each` computes the batches of a pass."""
         self.denoiser, self.noising, self.pairs, self.config = denoiser, noising, pairs, config
-        self.cancelled = cancelled
+        self.cancelled, self.each = cancelled, each
 
     def noised(self, chunks: Tensor, owner: Tensor, states: slice, draws: Draws, asked: bool = True) -> Noisy:
         """These chunks of these states; none of them unless the objective asks for them."""
@@ -185,27 +188,29 @@ class Objective:
         return noised(self.noising, chunks[:count], self.pairs.features[states], here, owner[:count])
 
     def errors(self, noisy: Noisy) -> list[Tensor]:
-        return denoising_errors(self.denoiser, noisy, self.config, self.cancelled)
+        return denoising_errors(self.denoiser, noisy, self.config, self.cancelled, self.each)
 
     @torch.no_grad()
-    def report(self, draws: Draws) -> tuple[float, float, float]:
-        """(loss, l⁺, l⁻), each a mean over pairs, on these draws."""
+    def report(self, draws: Draws, most: int | None = None) -> tuple[float, float, float]:
+        """(loss, l⁺, l⁻), each a mean over pairs, on these draws; `most`: of so many pairs a state."""
         pairs, count = self.pairs, draws.k.shape[1]
-        chunks, owner = pairs.positives, pairs.owner
+        rows = slice(None) if most is None else pairs.first(most)
+        chunks, owner, weights = pairs.positives[rows], pairs.owner[rows], pairs.weights[rows]
+        told = len(chunks)
         if self.config.objective != "awr":
             chunks = torch.cat([chunks, pairs.negatives])
             owner = torch.cat([owner, torch.arange(len(pairs.negatives), device=owner.device)])
         noisy = self.noised(chunks, owner, slice(0, len(pairs.features)), draws)
         errors = per_chunk(torch.cat(self.errors(noisy)), count)
-        winner, loser = errors[: len(pairs)], torch.full_like(errors[: len(pairs)], math.nan)
+        winner, loser = errors[:told], torch.full_like(errors[:told], math.nan)
         if self.config.objective != "awr":
-            loser = errors[len(pairs) :][pairs.owner]
-        loss = preference_loss(winner, loser, self.config, pairs.weights) / len(pairs)
+            loser = errors[told:][owner[:told]]
+        loss = preference_loss(winner, loser, self.config, weights) / told
         return float(loss), float(winner.mean()), float(loser.mean())
 
     def gradient(self, draws: Draws, cloning: Cloning | None = None) -> Float[Tensor, "P"]:
         """The loss's gradient, flat; with that of cloning added."""
-        total = self.zeros()
+        total: list[Tensor] = []
         cloned = [] if cloning is None else [(cloning.weight, self.cloned(cloning))]
         for states, rows in blocks(self.pairs):
             self.gather(states, rows, draws, [total], cloned)
@@ -215,14 +220,12 @@ class Objective:
     def gradients(self, draws: Draws) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
         """(g⁺, g⁻): the loss's gradient through the positives' errors and through the negatives', flat; their sum is
         the gradient of the loss. Following −g⁺ lowers l⁺, following −g⁻ raises l⁻."""
-        totals = [self.zeros(), self.zeros()]
+        totals: list[list[Tensor]] = [[], []]
         for states, rows in blocks(self.pairs):
             self.gather(states, rows, draws, totals, [])
-        at_winner, at_loser = (self.denoiser.pull_back(total) for total in totals)
+        nothing = [torch.zeros_like(leaf) for leaf in self.denoiser.leaves]
+        at_winner, at_loser = (self.denoiser.pull_back(total or nothing) for total in totals)
         return at_winner, at_loser
-
-    def zeros(self) -> list[Tensor]:
-        return [torch.zeros_like(leaf) for leaf in self.denoiser.leaves]
 
     def gather(
         self, states: slice, rows: slice, draws: Draws, totals: Sequence[list[Tensor]],
@@ -262,12 +265,15 @@ class Objective:
         """Add the gradients of Σ share · error."""
         if not errors:
             return
-        check(self.cancelled)
         weights = share.split([len(e) for e in errors])
-        weighted = torch.stack([error @ weight for error, weight in zip(errors, weights, strict=True)]).sum()
-        gradients = torch.autograd.grad(weighted, self.denoiser.leaves, materialize_grads=True)
-        for sum_, gradient in zip(total, gradients, strict=True):
-            sum_.add_(gradient)
+
+        def back(batch: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
+            check(self.cancelled)
+            error, weight = batch
+            return torch.autograd.grad(error @ weight, self.denoiser.leaves, materialize_grads=True)
+
+        for gradients in self.each(back, list(zip(errors, weights, strict=True))):
+            total[:] = [a + b for a, b in zip(total, gradients, strict=True)] if total else gradients
 
     def cloned(self, cloning: Cloning) -> Noisy:
         """A minibatch of demonstration chunks."""

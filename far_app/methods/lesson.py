@@ -23,6 +23,7 @@ from far_app.learning.memory import Encode, FeatureMemory
 from far_app.learning.pairs import Pairs, candidates, explored, merged, select, weighted_trajectory
 from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.preference import Demonstrations, Noising
+from far_app.learning.threads import Each, in_turn, on_threads
 from far_app.learning.trainable import Arrange
 from far_app.methods import evidence
 from far_app.methods.evidence import sent_chunks
@@ -47,6 +48,8 @@ class Learner:
     """How the policy sees."""
     demonstrations: Demonstrations | None
     arrange: Arrange
+    threads: int
+    """That learn at once."""
     rounds: Sequence[Pairs]
     """Of the trial's earlier lessons, where an update starts from the base with all of them."""
 
@@ -82,10 +85,14 @@ class Lesson:
 
     def run(self, progress: Progress) -> tuple[nn.Module | None, Pairs]:
         """The adapted denoiser (None when nothing changed) and the pairs it learnt from."""
+        with on_threads(self.learner.threads) as each:
+            return self._run(progress, each)
+
+    def _run(self, progress: Progress, each: Each) -> tuple[nn.Module | None, Pairs]:
         learner, config = self.learner, self.learner.config
         eyes = self.attribute(progress)
         awr = config.fcpa.objective == "awr"
-        pairs = self._trajectory(eyes) if awr else self._pairs(eyes, self.adaptation.flagged)
+        pairs = self._trajectory(eyes) if awr else self._pairs(eyes, self.adaptation.flagged, each)
         self.note("pairs", pairs=len(pairs), empty_states=pairs.empty_states)
         progress(self.adaptation)
         if not len(pairs):
@@ -98,13 +105,13 @@ class Lesson:
             denoiser, Noising(add_noise=diffusion.add_noise, steps=diffusion.TRAIN_STEPS),
             pairs if accumulate else merged([*learner.rounds, pairs]), config.fcpa, self._rng("fcpa"), self.cancelled,
             lambda step: (self.history.append(step), progress(step))[1], learner.demonstrations,
-            learner.arrange,
+            learner.arrange, each,
         )  # fmt: skip
         denoiser.requires_grad_(False)
         self.note("update", status=update.status, history=update.history, note=update.note)
         return (denoiser if update.changed else None), pairs
 
-    def _pairs(self, eyes: evidence.Eyes, ticks: tuple[int, ...]) -> Pairs:
+    def _pairs(self, eyes: evidence.Eyes, ticks: tuple[int, ...], each: Each = in_turn) -> Pairs:
         """Candidates under the policy that acted, filtered and ranked, for every flagged chunk."""
         learner, config, critic = self.learner, self.learner.config.pairs, eyes.critic
         spec = learner.spec
@@ -126,7 +133,7 @@ class Lesson:
 
         with torch.no_grad():
             stacked = torch.from_numpy(np.stack(noise)) if noise else torch.zeros(0, *shape)
-            chunks = candidates(sample, runner.condition(seen), stacked.to(seen.device), self.cancelled)
+            chunks = candidates(sample, runner.condition(seen), stacked.to(seen.device), self.cancelled, each)
             if not bool(torch.isfinite(chunks).all()):
                 raise FarError(f"the policy {learner.version} sampled a non-finite candidate; nothing was learnt")
             if config.explore > 0:

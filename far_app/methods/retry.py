@@ -60,6 +60,8 @@ class Ingredients:
     """Makes what learning sees with where nobody saw before: the policy's encoder in a faster form, for one thread."""
     arrange: Arrange = trainable
     """How the denoiser is run for candidates and the update; `plain` to compare with."""
+    threads: int = 1
+    """That learn at once, on a CPU; what is learnt does not depend on it."""
 
     def seeing(self) -> Encode:
         """How a lesson sees; for one thread."""
@@ -79,7 +81,7 @@ class RetryMethod:
         self.critic = ingredients.critic
         self.memory = ingredients.memory
         self._seeing = ingredients.seeing
-        self.arrange = ingredients.arrange
+        self.arrange, self.threads = ingredients.arrange, ingredients.threads
         self.config = ingredients.config
         self.demonstrations = ingredients.demonstrations
         self.perturbation = self.config.perturbation
@@ -158,7 +160,7 @@ class RetryMethod:
         return Learner(
             spec=self.policy.spec, version=self.policy.version, acting=self.acting, base=self.base,
             critic=self.critic, config=self.config, memory=self.memory, encode=self.encode,
-            demonstrations=self.demonstrations, arrange=self.arrange, rounds=self.rounds,
+            demonstrations=self.demonstrations, arrange=self.arrange, threads=self.threads, rounds=self.rounds,
         )  # fmt: skip
 
     def _restore(self) -> None:

@@ -1,6 +1,7 @@
 """The preference update: the printed formula, its gradient, shared draws, guards, cancellation, NaN."""
 
 import copy
+import dataclasses
 import math
 
 import numpy as np
@@ -130,6 +131,20 @@ def test_history_has_the_state_before_and_after_every_step():
     _, update = run(FCPAConfig(steps=4), progress=seen.append)
     assert [s.step for s in update.history] == [0, 1, 2, 3, 4]
     assert tuple(seen) == update.history
+
+
+def test_what_is_told_to_people_alone_is_of_each_states_first_pairs():
+    pairs = some_pairs(states=3, positives=4)
+    few = dataclasses.replace(pairs, positives=pairs.positives[[0, 1, 4, 5, 8, 9]], owner=pairs.owner[::2],
+                              weights=pairs.weights[::2])  # fmt: skip
+    draws = draw(np.random.default_rng(0), 3, 1, 100, LIKE)
+    told = Objective(runner(unet()), NOISING, pairs, FCPAConfig(), never).report(draws, most=2)
+    assert told == Objective(runner(unet()), NOISING, few, FCPAConfig(), never).report(draws)
+    config = FCPAConfig(steps=2, guard="stop", guard_rise=1e9)
+    _, unguarded = run(dataclasses.replace(config, guard="none"), pairs)
+    _, guarded = run(config, pairs)
+    _, few_guarded = run(config, few)
+    assert unguarded.history[0] == few_guarded.history[0] != guarded.history[0], "a guard decides by all of them"
 
 
 def test_no_steps_change_nothing():

@@ -50,6 +50,22 @@ def adapt(m: Method, attempt=None, cancelled=lambda: False):
     return m.adapt(attempt or small_attempt(), cancelled, lambda step: None)
 
 
+@pytest.mark.parametrize("guard", ["none", "bc", "scale"])
+def test_a_lesson_is_the_same_on_any_number_of_threads(guard):
+    config = dataclasses.replace(QUICK, fcpa=dataclasses.replace(QUICK.fcpa, guard=guard))
+
+    def learnt(threads: int) -> tuple[list[bytes], tuple]:
+        m = made("fcpa", config, small_policy())
+        m.threads = threads
+        lesson = adapt(m)
+        assert lesson.status == "adapted"
+        assert threading.active_count() == before
+        return [tensor.tobytes() for tensor in m.adapted.tensors.values()], lesson.history
+
+    before = threading.active_count()
+    assert learnt(1) == learnt(2) == learnt(3)
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_is_a_method(name):
     m = made(name)

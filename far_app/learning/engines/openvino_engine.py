@@ -32,7 +32,7 @@ def make(
         cameras = CompiledCameras(network.encoder, network.config.image_size, precision)
         looking = cameras.looking(together)
         begin = looking.begin if together else None
-        frames = Frames(network, looking, each_alone, another=cameras.looking, begin=begin)
+        frames = Frames(network, looking, each_alone, another=partial(cameras.looking, together), begin=begin)
         return StepwiseEngine(name, network, version, frames, chain)
     except (ImportError, RuntimeError) as error:
         raise EngineError(f"OpenVINO could not build it: {error}") from error
