@@ -19,7 +19,7 @@ from torch import nn
 from far_app.config import FCPAConfig
 from far_app.errors import ConfigError, PolicyError
 from far_app.learning.adamw import FlatAdamW, guarded_step
-from far_app.learning.cancellation import Cancelled
+from far_app.learning.cancellation import Cancelled, check
 from far_app.learning.pairs import Pairs
 from far_app.learning.preference import Cloning, Demonstrations, Noising, Objective, draw
 from far_app.learning.threads import Each, in_turn
@@ -71,7 +71,7 @@ def adapt(
     Progress is told before the first step (step 0) and after each. Raises AdaptationCancelledError on cancellation;
     the copy is then of no use."""
     check_config(config, demonstrations)
-    runner = arrange(denoiser, pairs.negatives.shape[1])
+    runner = arrange(denoiser, pairs.negatives.shape[1], look=lambda: check(cancelled))
     objective = Objective(runner, noising, pairs, config, cancelled, each)
     states = len(pairs.features)
     fixed = draw(rng, states, FIXED_DRAWS, noising.steps, pairs.negatives)

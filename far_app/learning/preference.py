@@ -30,7 +30,7 @@ from far_app.types import ARM_DIMS
 AddNoise = Callable[[Float[Tensor, "B H A"], Float[Tensor, "B H A"], Int[Tensor, "B"]], Float[Tensor, "B H A"]]
 """a_k from (a, ε, k)."""
 BATCH = 256
-"""Most rows a pass: enough to be quick, few enough that a cancellation between two is noticed within 100 ms."""
+"""Most rows a pass: enough to be quick, few enough that a cancellation is noticed within 100 ms."""
 STATES_AT_ONCE = 16
 """States whose activations are kept for one backward pass; bounds memory, not the result."""
 BC_BATCH = 64
@@ -136,8 +136,6 @@ def denoising_errors(
         here, row = noisy.state[rows].unique(return_inverse=True)
         condition = denoiser.condition(noisy.features[here]).index_select(0, row)
         predicted = denoiser.run(noisy.chunks[rows], noisy.k[rows], condition)
-        if predicted.requires_grad:
-            predicted.register_hook(lambda _: check(cancelled))  # on the way back too, batch by batch
         squared = (noisy.noise[rows] - predicted)[..., :dims].square().flatten(1)
         return squared.sum(1) if config.reduction == "sum" else squared.mean(1)
 

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from far_app.learning.fast_unet import FastUnet, arrangeable
+from far_app.learning.layers import Look, unwatched
 
 
 class Trainable(Protocol):
@@ -41,8 +42,8 @@ class Trainable(Protocol):
 class PlainDenoiser:
     """A Trainable that is the module itself."""
 
-    def __init__(self, module: nn.Module) -> None:
-        self.module = module
+    def __init__(self, module: nn.Module, look: Look = unwatched) -> None:
+        self.module, self._look = module, look
         self.parameters: Sequence[Tensor] = [p for p in module.parameters() if p.requires_grad]
         self.leaves: Sequence[Tensor] = self.parameters
 
@@ -50,7 +51,10 @@ class PlainDenoiser:
         return features
 
     def run(self, noisy: Float[Tensor, "B H A"], k: Int[Tensor, "B"], condition: Tensor) -> Float[Tensor, "B H A"]:
-        return self.module(noisy, k, condition)
+        predicted = self.module(noisy, k, condition)
+        if predicted.requires_grad:
+            predicted.register_hook(lambda _: self._look())
+        return predicted
 
     def pull_back(self, gradients: Sequence[Tensor]) -> Float[Tensor, "P"]:
         return torch.cat([g.flatten() for g in gradients])
@@ -60,15 +64,18 @@ class PlainDenoiser:
 
 
 class Arrange(Protocol):
-    def __call__(self, module: nn.Module, horizon: int, train: bool = True) -> Trainable: ...
+    def __call__(
+        self, module: nn.Module, horizon: int, train: bool = True, look: Look = unwatched
+    ) -> Trainable: ...  # fmt: skip
 
 
-def plain(module: nn.Module, horizon: int, train: bool = True) -> Trainable:
+def plain(module: nn.Module, horizon: int, train: bool = True, look: Look = unwatched) -> Trainable:
     """The module as it is written: what `trainable` is measured against and tested against."""
-    return PlainDenoiser(module)
+    return PlainDenoiser(module, look)
 
 
-def trainable(module: nn.Module, horizon: int, train: bool = True) -> Trainable:
-    """The quickest way to run this denoiser on its device; gradients only with `train`."""
+def trainable(module: nn.Module, horizon: int, train: bool = True, look: Look = unwatched) -> Trainable:
+    """The quickest way to run this denoiser on its device; gradients only with `train`, and `look` is called as they
+    are computed: it may raise to end that."""
     fast = arrangeable(module, horizon)
-    return FastUnet(fast, horizon, train) if fast is not None else PlainDenoiser(module)
+    return FastUnet(fast, horizon, train, look) if fast is not None else PlainDenoiser(module, look)

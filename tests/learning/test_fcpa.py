@@ -308,7 +308,7 @@ def test_cancellation_ends_it_between_two_passes():
     assert len(looks) == 7
 
 
-def test_it_looks_for_cancellation_before_and_behind_every_small_batch(monkeypatch):
+def test_it_looks_for_cancellation_before_every_small_batch_and_between_layers_on_the_way_back(monkeypatch):
     looks, rows, learnt_from = [], [], []
     run_ = FastUnet.run
 
@@ -319,4 +319,4 @@ def test_it_looks_for_cancellation_before_and_behind_every_small_batch(monkeypat
     monkeypatch.setattr(FastUnet, "run", counting)
     run(FCPAConfig(steps=2), some_pairs(states=20, positives=8), cancelled=lambda: bool(looks.append(1)))
     assert max(rows + learnt_from) <= preference.BATCH
-    assert len(looks) >= len(rows) + 2 * len(learnt_from)
+    assert len(looks) >= len(rows) + 6 * len(learnt_from)
