@@ -72,6 +72,7 @@ def adapt(
     the copy is then of no use."""
     check_config(config, demonstrations)
     runner = arrange(denoiser, pairs.negatives.shape[1], look=lambda: check(cancelled))
+    check(cancelled)
     objective = Objective(runner, noising, pairs, config, cancelled, each)
     states = len(pairs.features)
     fixed = draw(rng, states, FIXED_DRAWS, noising.steps, pairs.negatives)
@@ -102,6 +103,7 @@ def adapt(
                 guarded_step(optimiser, *objective.gradients(fresh))
             else:
                 optimiser.step(objective.gradient(fresh, cloning))
+            check(cancelled)
             runner.refresh()
             winner = report(step).winner_error
             if decides and winner > limit:

@@ -99,6 +99,7 @@ class Lesson:
             self.note(status="empty", note="no chunk could be paired")
             return None, pairs
 
+        check(self.cancelled)
         accumulate = config.fcpa.accumulate
         denoiser = copy.deepcopy((learner.acting if accumulate else learner.base).denoiser).requires_grad_(True).eval()
         update = fcpa.adapt(
@@ -139,6 +140,7 @@ class Lesson:
             if config.explore > 0:
                 chunks = explored(chunks, config.explore, self._rng("exploration"))
             self.note("candidates")
+            check(self.cancelled)
             pairs = select(chunks, seen, negatives, critic.q, config, shown)
             self.note(contrasts=evidence.contrasts(pairs, ticks, shown, critic, config.arm_only))
             return pairs
