@@ -88,6 +88,11 @@ class RemoteRobot:
             self._let_go()
             raise
 
+    @property
+    def on_the_way(self) -> float:
+        """far_app.protocols.Distant: half the round trip to another machine."""
+        return self.clock.round_trip / 2
+
     def _compare_clocks(self, patience: float) -> None:
         assert self._clock_thread is not None, "two machines have a clock thread"
         if not self._clock_thread.known.wait(patience):

@@ -80,6 +80,16 @@ class Robot(Protocol):
         ...
 
 
+@runtime_checkable
+class Distant(Protocol):
+    """A Robot that a target reaches after a while."""
+
+    @property
+    def on_the_way(self) -> float:
+        """Seconds from a target's sending to its arrival, as far as is known."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class Frame:
     """One picture of one camera."""

@@ -32,12 +32,12 @@ def in_turn(work: Callable[[T], R], pieces: Sequence[T]) -> list[R]:
 
 @contextlib.contextmanager
 def on_threads(count: int) -> Iterator[Each]:
-    """Each, on `count` threads with the caller's niceness and its choice whether gradients are kept; none of them is at
-    work any more when this is left."""
+    """Each, on `count` threads with the caller's niceness and its choice whether gradients are kept, torch's operations
+    on one of them each; none is at work any more when this is left."""
     if count <= 1:
         yield in_turn
         return
-    with ThreadPoolExecutor(count, thread_name_prefix="learning") as pool:
+    with ThreadPoolExecutor(count, "learning", initializer=torch.set_num_threads, initargs=(1,)) as pool:
 
         def each(work: Callable[[T], R], pieces: Sequence[T]) -> list[R]:
             keeps = torch.is_grad_enabled()

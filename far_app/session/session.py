@@ -21,7 +21,7 @@ from far_app.errors import RobotError
 from far_app.events import TrialEvents
 from far_app.guided import guided_trial
 from far_app.motion import ActionScale
-from far_app.protocols import Hold, Method, Robot, SuccessDetector
+from far_app.protocols import Distant, Hold, Method, Robot, SuccessDetector
 from far_app.scheduling import LOOP_PRIORITY, real_time_inside
 from far_app.session.board import Board
 from far_app.session.clock import TickClock
@@ -77,7 +77,7 @@ class Session:
         self.planner, self.recorder, self.statistics = planner, recorder, statistics
         self.robot = WatchedRobot(robot, statistics)
         self.detector = OperatorOverride(detector)
-        self.clock = TickClock(task.rate)
+        self.clock = TickClock(task.rate, robot if isinstance(robot, Distant) else None)
         self.board = Board(
             task, scale, session=settings.name, method=method.name, trials=settings.trials,
             chunk_horizon=method.policy.spec.horizon,

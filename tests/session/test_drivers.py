@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -68,6 +69,23 @@ def test_work_begins_as_early_as_the_slowest_tick_lately_needed_so_that_targets_
         clock.wait()
         clock.sent()
     assert clock.lead == pytest.approx(LEAST, abs=1e-6), "what is long past is forgotten"
+
+
+def test_targets_for_another_machine_leave_earlier_by_their_way_there(monkeypatch):
+    fake, robot = FakeTime(monkeypatch), SimpleNamespace(on_the_way=0.0)
+    clock = TickClock(rate=30.0, robot=robot)
+    clock.restart()
+    for way in (0.0, 0.0057, 0.0057, 0.009, 0.009):
+        robot.on_the_way = way
+        due = clock.wait()
+        fake.now += 0.0004
+        clock.sent()
+    assert fake.now + way <= due
+    assert clock.lead == pytest.approx(LEAST + way - ON_THE_WAY)
+    robot.on_the_way = 3.0
+    clock.wait()
+    clock.sent()
+    assert clock.lead <= LEAST + clock.period / 2, "it does not look at observations of ticks ago"
 
 
 def test_a_stall_is_counted_and_never_followed_by_a_burst(monkeypatch):
