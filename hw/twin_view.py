@@ -70,7 +70,6 @@ def visual_model(
     model = spec.compile()
     model.vis.quality.offsamples = 0
     model.vis.quality.shadowsize = 0
-    model.vis.global_.offwidth = model.vis.global_.offheight = 1024
     return model
 
 
@@ -99,6 +98,8 @@ class TwinView:
 
     def _renderer(self, size: int) -> mujoco.Renderer:
         if size not in self._renderers:
+            # its frame buffer, all of which is cleared for each picture
+            self._model.vis.global_.offwidth = self._model.vis.global_.offheight = size
             try:
                 renderer = mujoco.Renderer(self._model, size, size)
             except Exception as error:  # MuJoCo raises whatever its GL back end raised
