@@ -29,6 +29,7 @@ from far_app.cli.stage import stage
 from far_app.errors import ConfigError, FarError
 from far_app.learning.cancellation import Cancelled
 from far_app.protocols import Method, Policy, Progress
+from far_app.scheduling import learning_threads
 from far_app.session.adaptation import unchanged
 from far_app.session.inbox import IntentInbox
 from far_app.session.statistics import LoopStatistics, percentiles
@@ -60,6 +61,7 @@ class AdaptOptions:
     """Critic checkpoint; the one beside the policy by default."""
     seed: int = 0
     torch_threads: int = 1
+    learning_threads: int = field(default_factory=learning_threads)
     attempt_seconds: float = 20.0
     """How long to run trials first, to see one fail."""
     growth: str = "quickstart"
@@ -100,7 +102,8 @@ def measure(options: AdaptOptions) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="far-bench-") as recordings:
         run = RunOptions(
             seed=options.seed, policy=options.policy, critic=options.critic, method="far", headless=True, rerun=False,
-            torch_threads=options.torch_threads, recordings=Path(recordings), max_attempts=ATTEMPTS, trials=1000,
+            torch_threads=options.torch_threads, learning_threads=options.learning_threads,
+            recordings=Path(recordings), max_attempts=ATTEMPTS, trials=1000,
             retry=replace(recommended(RunOptions.task, options.policy), adaptation_limit=PATIENCE),
         )  # fmt: skip
         with stage(run) as stage_:

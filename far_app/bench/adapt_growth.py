@@ -1,4 +1,5 @@
-"""How an adaptation's cost grows with the attempt's length and with M, without a loop beside it. Random weights."""
+"""How an adaptation's cost grows with the attempt's length and with M, without a loop beside it, on one thread. Random
+weights."""
 
 from __future__ import annotations
 

@@ -170,9 +170,10 @@ def equip(model: Model, method: str, retry: RetryConfig, learning_threads: int =
         if retry.fcpa.guard == "bc" or entry.needs_demonstrations:
             demonstrations = load_demonstrations(model.critic_file, model.network)
         retry = with_threshold(retry, model.critic_file)
+    on_cpu = model.network.normalizer.low.device.type == "cpu"
     ingredients = Ingredients(
         network=model.network, critic=model.critic, config=retry, demonstrations=demonstrations, act=model.act,
-        memory=model.memory, encoder=model.base.another_encoder, threads=learning_threads,
+        memory=model.memory, encoder=model.base.another_encoder, threads=learning_threads if on_cpu else 1,
     )  # fmt: skip
     return Parts(
         method=make_method(method, ingredients), policy_name=model.name, max_attempts=entry.attempts,

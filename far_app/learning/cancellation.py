@@ -1,4 +1,5 @@
-"""How a background adaptation is told to end: it looks at `cancelled` before every pass of the denoiser."""
+"""How a background adaptation is told to end: it looks at `cancelled` before every pass of the denoiser, and
+between its layers on the way back."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ class AdaptationCancelledError(Exception):
 
 
 def check(cancelled: Cancelled) -> None:
-    """Raise when the adaptation is no longer wanted. Called between batches, some 20 ms apart."""
+    """Raise when the adaptation is no longer wanted. Called some 20 ms apart at most."""
     if cancelled():
         raise AdaptationCancelledError
 

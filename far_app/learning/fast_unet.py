@@ -24,20 +24,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from far_app.learning import kernels
+from far_app.learning.cancellation import Cancelled, never
 from far_app.learning.diffusion import TRAIN_STEPS
-from far_app.learning.layers import (
-    Affine,
-    Convolved,
-    Down,
-    Layers,
-    Look,
-    Residual,
-    Taps,
-    Up,
-    Whole,
-    by_kernels,
-    unwatched,
-)  # fmt: skip
+from far_app.learning.layers import Affine, Convolved, Down, Layers, Residual, Taps, Up, Whole, by_kernels
 from far_app.learning.unet import ConditionalUnet1d
 
 
@@ -90,13 +79,13 @@ def arrangeable(module: nn.Module, horizon: int) -> ConditionalUnet1d | None:
 class FastUnet:
     """A ConditionalUnet1d ready to run many times: `refresh` after its weights changed.
 
-    With `train`, the matrices collect gradients, which `pull_back` turns into the weights' own; `look` is called
-    between the layers on the way back, and may raise to end it."""
+    With `train`, the matrices collect gradients, which `pull_back` turns into the weights' own; `cancelled` is
+    looked at between the layers on the way back."""
 
     def __init__(
-        self, unet: ConditionalUnet1d, horizon: int, train: bool = False, look: Look = unwatched
+        self, unet: ConditionalUnet1d, horizon: int, train: bool = False, cancelled: Cancelled = never
     ) -> None:  # fmt: skip
-        self.unet, self.horizon, self.train, self._look = unet, horizon, train, look
+        self.unet, self.horizon, self.train, self._cancelled = unet, horizon, train, cancelled
         self.parameters: Sequence[Tensor] = [p for p in unet.parameters() if p.requires_grad]
         self.leaves: Sequence[Tensor] = ()
         """FiLM's two matrices, then those of `layers`."""
@@ -137,7 +126,7 @@ class FastUnet:
         """The same, given what scales and shifts every block. No gradient comes back on the noisy chunk."""
         if self.train and torch.is_grad_enabled():
             return _Pass.apply(  # type: ignore[return-value]
-                self.layers, self._matrices, self._look, noisy, film, *self.leaves[2:]
+                self.layers, self._matrices, self._cancelled, noisy, film, *self.leaves[2:]
             )  # fmt: skip
         return self.layers.forward(noisy.contiguous(), film, self._matrices)
 
@@ -150,18 +139,18 @@ class _Pass(torch.autograd.Function):
         ctx,
         layers: Layers,
         matrices: Sequence[Tensor],
-        look: Look,
+        cancelled: Cancelled,
         noisy: Tensor,
         film: Tensor,
         *leaves: Tensor,  # noqa: ANN001
     ) -> Tensor:
-        ctx.layers, ctx.look, ctx.film, ctx.matrices, ctx.kept = layers, look, film.detach(), matrices, []
+        ctx.layers, ctx.cancelled, ctx.film, ctx.matrices, ctx.kept = layers, cancelled, film.detach(), matrices, []
         return layers.forward(noisy.detach().contiguous(), ctx.film, ctx.matrices, ctx.kept)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient: Tensor) -> tuple[Any, ...]:  # noqa: ANN001
-        into, to_film = ctx.layers.back(gradient.contiguous(), ctx.film, ctx.matrices, ctx.kept, ctx.look)
+        into, to_film = ctx.layers.back(gradient.contiguous(), ctx.film, ctx.matrices, ctx.kept, ctx.cancelled)
         return None, None, None, None, to_film, *into
 
 

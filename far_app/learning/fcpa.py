@@ -71,7 +71,7 @@ def adapt(
     Progress is told before the first step (step 0) and after each. Raises AdaptationCancelledError on cancellation;
     the copy is then of no use."""
     check_config(config, demonstrations)
-    runner = arrange(denoiser, pairs.negatives.shape[1], look=lambda: check(cancelled))
+    runner = arrange(denoiser, pairs.negatives.shape[1], cancelled=cancelled)
     check(cancelled)
     objective = Objective(runner, noising, pairs, config, cancelled, each)
     states = len(pairs.features)

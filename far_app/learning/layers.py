@@ -7,7 +7,7 @@ takes it off again, last in, first out; it returns the gradient on the layer's i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,14 +17,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from far_app.learning import kernels
+from far_app.learning.cancellation import Cancelled, check, never
 
 Kept = list[Any]
-Look = Callable[[], None]
-"""Called every few ms of a long way; raises to end it."""
-
-
-def unwatched() -> None:
-    """The Look of who ends nothing."""
 
 
 @dataclass(frozen=True)
@@ -206,27 +201,28 @@ class Layers:
 
     def back(
         self, g: Float[Tensor, "B H A"], film: Float[Tensor, "B M"], m: Sequence[Tensor], kept: Kept,
-        look: Look = unwatched,
+        cancelled: Cancelled = never,
     ) -> tuple[list[Tensor | None], Float[Tensor, "B M"]]:  # fmt: skip
-        """The gradients on the matrices and on the condition, from the output's; `kept` is used up."""
-        look()
+        """The gradients on the matrices and on the condition, from the output's; `kept` is used up. Looks for
+        cancellation between levels, some ms apart."""
+        check(cancelled)
         into: list[Tensor | None] = [None] * len(m)
         to_film = torch.empty_like(film)
         g = self.out.back(g.flatten(0, 1), m, kept, into).view(*g.shape[:2], -1)
         g = self.last.back(g, film, m, kept, into, to_film)
         sides: list[Tensor] = []
         for up in reversed(self.ups):
-            look()
+            check(cancelled)
             g = up.grow.back(g.view(len(g), g.shape[1] // 2, -1), m, kept, into)
             g = up.first.back(up.second.back(g, film, m, kept, into, to_film), film, m, kept, into, to_film)
             below, side = g.chunk(2, dim=2)
             g = below.contiguous()
             sides.append(side)
         for block in reversed(self.middle):
-            look()
+            check(cancelled)
             g = block.back(g, film, m, kept, into, to_film)
         for down in reversed(self.downs):
-            look()
+            check(cancelled)
             if down.shrink is not None:
                 g = down.shrink.back(g, m, kept, into)
             if sides:

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from far_app.learning.cancellation import Cancelled, check, never
 from far_app.learning.fast_unet import FastUnet, arrangeable
-from far_app.learning.layers import Look, unwatched
 
 
 class Trainable(Protocol):
@@ -42,8 +42,8 @@ class Trainable(Protocol):
 class PlainDenoiser:
     """A Trainable that is the module itself."""
 
-    def __init__(self, module: nn.Module, look: Look = unwatched) -> None:
-        self.module, self._look = module, look
+    def __init__(self, module: nn.Module, cancelled: Cancelled = never) -> None:
+        self.module, self._cancelled = module, cancelled
         self.parameters: Sequence[Tensor] = [p for p in module.parameters() if p.requires_grad]
         self.leaves: Sequence[Tensor] = self.parameters
 
@@ -53,7 +53,7 @@ class PlainDenoiser:
     def run(self, noisy: Float[Tensor, "B H A"], k: Int[Tensor, "B"], condition: Tensor) -> Float[Tensor, "B H A"]:
         predicted = self.module(noisy, k, condition)
         if predicted.requires_grad:
-            predicted.register_hook(lambda _: self._look())
+            predicted.register_hook(lambda _: check(self._cancelled))
         return predicted
 
     def pull_back(self, gradients: Sequence[Tensor]) -> Float[Tensor, "P"]:
@@ -65,17 +65,17 @@ class PlainDenoiser:
 
 class Arrange(Protocol):
     def __call__(
-        self, module: nn.Module, horizon: int, train: bool = True, look: Look = unwatched
+        self, module: nn.Module, horizon: int, train: bool = True, cancelled: Cancelled = never
     ) -> Trainable: ...  # fmt: skip
 
 
-def plain(module: nn.Module, horizon: int, train: bool = True, look: Look = unwatched) -> Trainable:
+def plain(module: nn.Module, horizon: int, train: bool = True, cancelled: Cancelled = never) -> Trainable:
     """The module as it is written: what `trainable` is measured against and tested against."""
-    return PlainDenoiser(module, look)
+    return PlainDenoiser(module, cancelled)
 
 
-def trainable(module: nn.Module, horizon: int, train: bool = True, look: Look = unwatched) -> Trainable:
-    """The quickest way to run this denoiser on its device; gradients only with `train`, and `look` is called as they
-    are computed: it may raise to end that."""
+def trainable(module: nn.Module, horizon: int, train: bool = True, cancelled: Cancelled = never) -> Trainable:
+    """The quickest way to run this denoiser on its device; gradients only with `train`, and `cancelled` is looked
+    at as they are computed."""
     fast = arrangeable(module, horizon)
-    return FastUnet(fast, horizon, train, look) if fast is not None else PlainDenoiser(module, look)
+    return FastUnet(fast, horizon, train, cancelled) if fast is not None else PlainDenoiser(module, cancelled)

@@ -23,7 +23,7 @@ from far_app.learning.memory import Encode, FeatureMemory
 from far_app.learning.pairs import Pairs, candidates, explored, merged, select, weighted_trajectory
 from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.preference import Demonstrations, Noising
-from far_app.learning.threads import Each, in_turn, on_threads
+from far_app.learning.threads import Each, on_threads
 from far_app.learning.trainable import Arrange
 from far_app.methods import evidence
 from far_app.methods.evidence import sent_chunks
@@ -112,7 +112,7 @@ class Lesson:
         self.note("update", status=update.status, history=update.history, note=update.note)
         return (denoiser if update.changed else None), pairs
 
-    def _pairs(self, eyes: evidence.Eyes, ticks: tuple[int, ...], each: Each = in_turn) -> Pairs:
+    def _pairs(self, eyes: evidence.Eyes, ticks: tuple[int, ...], each: Each) -> Pairs:
         """Candidates under the policy that acted, filtered and ranked, for every flagged chunk."""
         learner, config, critic = self.learner, self.learner.config.pairs, eyes.critic
         spec = learner.spec

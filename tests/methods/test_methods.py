@@ -10,44 +10,16 @@ import pytest
 import torch
 
 from far_app.config import AttributionConfig, FCPAConfig, PairsConfig, PerturbationConfig, RetryConfig
-from far_app.errors import ConfigError, FarError
-from far_app.learning.policy import DiffusionPolicy
-from far_app.learning.preference import Demonstrations
+from far_app.errors import ConfigError
 from far_app.learning.runtime import ActingPolicy
 from far_app.learning.trainable import plain, trainable
 from far_app.methods import METHODS, Ingredients, method
-from far_app.methods.evidence import history, sent_chunks
+from far_app.methods.evidence import sent_chunks
 from far_app.protocols import Method
 from far_app.recording.codec import codec, decode
 from far_app.types import Adaptation, FlagCorrection
 from tests.learning.small import small_attempt, small_critic, small_policy
-
-QUICK = RetryConfig(
-    pairs=PairsConfig(candidates=8, positives=3, d_max=50.0), fcpa=FCPAConfig(steps=3, lr=1e-3, draws=2)
-)
-
-
-def made(name: str, config: RetryConfig = QUICK, network: DiffusionPolicy | None = None):
-    network = network or small_policy()
-    critic = small_critic(network)
-    return method(name, Ingredients(
-        network=network, critic=critic, config=config, demonstrations=demonstrations(network),
-        act=lambda network, version, steering=None: ActingPolicy(network, version, critic, "torch", steering),
-    ))  # fmt: skip
-
-
-def demonstrations(network: DiffusionPolicy) -> Demonstrations:
-    features = network.encode([history(small_attempt(), t, 2) for t in range(0, 40, 4)])
-    return Demonstrations(features=features, chunks=torch.zeros(len(features), 8, 7))
-
-
-def plan(m: Method, seed: int = 0, tick: int = 1) -> np.ndarray:
-    noise = np.random.default_rng(seed).standard_normal((1, 8, 7)).astype(np.float32)
-    return m.policy.plan([history(small_attempt(), tick, 2)], [tick], noise)[0].actions
-
-
-def adapt(m: Method, attempt=None, cancelled=lambda: False):
-    return m.adapt(attempt or small_attempt(), cancelled, lambda step: None)
+from tests.methods.making import QUICK, adapt, made, plan
 
 
 @pytest.mark.parametrize("guard", ["none", "bc", "scale"])
@@ -351,64 +323,3 @@ def test_the_perturbation_follows_the_configuration():
     m = made("far", RetryConfig(perturbation=PerturbationConfig(kind="smoothed", dims=(0,), probability=1.0)))
     delta = m.perturb(2, 0)
     assert all(delta(t)[0] != 0 and not delta(t)[1:].any() for t in range(10))
-
-
-def test_an_undone_lesson_leaves_no_trace_and_a_restored_one_is_the_same():
-    m = made("far")
-    m.begin(5)
-    base = plan(m)
-    adapt(m)
-    first, lesson = m.adapted, plan(m)
-    adapt(m, small_attempt(index=2))
-    assert m.policy.version == "base+a2"
-    m.use(first, "1:base+a1", base=False)
-    assert m.policy.version == "1:base+a1" and np.array_equal(plan(m), lesson)
-    again = adapt(m, small_attempt(index=2))
-    assert again.version == "base+a3" and m.adapted.parent == "1:base+a1", "later lessons build on it"
-    m.use(None, "base", base=False)
-    assert m.policy.version == "base" and np.array_equal(plan(m), base)
-
-
-def test_lessons_that_restart_forget_the_pairs_of_an_undone_one():
-    config = dataclasses.replace(QUICK, fcpa=dataclasses.replace(QUICK.fcpa, accumulate=False))
-    m = made("far", config)
-    m.begin(5)
-    adapt(m)
-    first = m.adapted
-    adapt(m, small_attempt(index=2))
-    assert len(m.rounds) == 2
-    m.use(first, "1:base+a1", base=False)
-    assert len(m.rounds) == 1
-    m.use(None, "base", base=False)
-    assert m.rounds == []
-
-
-def test_a_kept_version_begins_the_coming_trials_and_the_first_base_is_still_there():
-    network = small_policy()
-    weights = copy.deepcopy(network.state_dict())
-    m = made("far", network=network)
-    m.begin(5)
-    base = plan(m)
-    adapt(m)
-    kept, lesson = m.adapted, plan(m)
-    m.use(kept, "1:base+a1", base=True)
-    m.begin(6)
-    assert m.policy.version == "1:base+a1" and np.array_equal(plan(m), lesson)
-    adapt(m, small_attempt(index=1))
-    assert m.adapted.parent == "1:base+a1" and m.adapted.base == kept.base
-    m.use(None, "base", base=True)
-    m.begin(7)
-    assert np.array_equal(plan(m), base)
-    assert all(torch.equal(v, weights[k]) for k, v in network.state_dict().items()), "the base is never written to"
-
-
-def test_weights_of_another_policy_are_refused_and_change_nothing():
-    m = made("far")
-    m.begin(5)
-    adapt(m)
-    version = m.policy.version
-    with pytest.raises(FarError, match="fingerprint"):
-        m.use(dataclasses.replace(m.adapted, base="another"), "1:base+a1", base=False)
-    with pytest.raises(FarError, match="do not fit"):
-        m.use(dataclasses.replace(m.adapted, tensors={"nothing": np.zeros(1)}), "1:base+a1", base=False)
-    assert m.policy.version == version
