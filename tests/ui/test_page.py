@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from ui_process import PageProcess, free_port, wait_until
+from ui_process import PageProcess, free_port, settles, wait_until
 from ui_stage import Stage, adapting, running, stopped
 
 from far_app.session_states import Intent, State
@@ -67,6 +67,7 @@ def tab(opened: tuple[Any, Stage], source: Stage) -> Any:
     page.evaluate("document.activeElement.blur()")
     page.wait_for_selector("#op-state[data-state='RUNNING'][data-tick='87']")
     page.wait_for_selector("#op-stop:has-text('space key')")
+    page.wait_for_selector("button:has-text('Pause'):has-text('key P'):not(:disabled)")  # a moment after the state
     return page
 
 
@@ -172,13 +173,17 @@ def test_no_control_is_dead_without_a_reason(tab: Any, source: Stage, state: Sta
     """In every state of the session, and with no app at all."""
     source.telemetry = None if state is None else replace(running(5), state=state, allowed=(Intent.STOP,))
     tab.wait_for_selector("button:has-text('Pause'):disabled")
-    tab.wait_for_timeout(500)
-    labels = tab.evaluate(
-        """() => [...document.querySelectorAll('button.mantine-Button-root')]
-            .filter(b => b.offsetWidth > 0 && getComputedStyle(b).visibility === 'visible').map(b => b.innerText)"""
-    )
-    assert len(labels) >= 10
-    assert all(len(label.split("\n")) == 2 and label.split("\n")[1] for label in labels if label != "STOP"), labels
+
+    def each_says_why() -> None:
+        labels = tab.evaluate(
+            """() => [...document.querySelectorAll('button.mantine-Button-root:disabled')]
+                .filter(b => b.offsetWidth > 0 && getComputedStyle(b).visibility === 'visible').map(b => b.innerText)"""
+        )
+        reasons = {label.split("\n")[0]: label.split("\n")[1:] for label in labels}
+        assert reasons.keys() >= {"Pause", "Skip trial", "End session", "You have control"}
+        assert all(len(why) == 1 and why[0] and not why[0].startswith("key ") for why in reasons.values()), reasons
+
+    settles(each_says_why)
 
 
 def test_question_mark_shows_every_key_and_hides_them_again(tab: Any, source: Stage) -> None:
@@ -292,24 +297,27 @@ def test_nothing_is_clipped_or_covered(tab: Any, source: Stage, width: int, heig
     source.telemetry = adapting()
     tab.set_viewport_size({"width": width, "height": height})
     tab.wait_for_selector("#op-state[data-state='LEARNING']")
-    tab.wait_for_timeout(500)
-    boxes = tab.evaluate(
-        """() => { const cells = ['#op-state', '#op-stop', '#op-adapt', '#op-history', '#op-events', '#op-loop']
-            .map(s => document.querySelector(s).parentElement)
-            .concat([...document.querySelectorAll('button.mantine-Button-root')].map(b => b.parentElement)
-                .filter(e => e.getBoundingClientRect().width > 0 && getComputedStyle(e).visibility === 'visible'))
-            .concat([...document.querySelectorAll('.uplot-container')]);
-          return cells.map(e => { const r = e.getBoundingClientRect();
-            return [r.left, r.top, r.right, r.bottom, (e.innerText || '').slice(0, 20)]; }); }"""
-    )
-    for left, top, right, bottom, text in boxes:
-        assert -1 <= left < right <= width + 1, text
-        assert -1 <= top < bottom <= height + 1, text
-    for i, a in enumerate(boxes):
-        for b in boxes[i + 1 :]:
-            across = min(a[2], b[2]) - max(a[0], b[0])
-            down = min(a[3], b[3]) - max(a[1], b[1])
-            assert across <= 1 or down <= 1, (a[4], b[4])
+
+    def all_within_and_apart() -> None:
+        boxes = tab.evaluate(
+            """() => { const cells = ['#op-state', '#op-stop', '#op-adapt', '#op-history', '#op-events', '#op-loop']
+                .map(s => document.querySelector(s).parentElement)
+                .concat([...document.querySelectorAll('button.mantine-Button-root')].map(b => b.parentElement)
+                    .filter(e => e.getBoundingClientRect().width > 0 && getComputedStyle(e).visibility === 'visible'))
+                .concat([...document.querySelectorAll('.uplot-container')]);
+              return cells.map(e => { const r = e.getBoundingClientRect();
+                return [r.left, r.top, r.right, r.bottom, (e.innerText || '').slice(0, 20)]; }); }"""
+        )
+        for left, top, right, bottom, text in boxes:
+            assert -1 <= left < right <= width + 1, text
+            assert -1 <= top < bottom <= height + 1, text
+        for i, a in enumerate(boxes):
+            for b in boxes[i + 1 :]:
+                across = min(a[2], b[2]) - max(a[0], b[0])
+                down = min(a[3], b[3]) - max(a[1], b[1])
+                assert across <= 1 or down <= 1, (a[4], b[4])
+
+    settles(all_within_and_apart)
 
 
 def test_a_second_browser_that_comes_late_sees_everything(tab: Any, browser: Any, source: Stage) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from test_page import ARGUMENTS, CHROMIUM
 from test_trials_panel import PLAN, decoded
-from ui_process import PageProcess, free_port
+from ui_process import PageProcess, free_port, settles
 from ui_stage import Stage, picture, running
 
 from far_app.recording.images import encode_png
@@ -64,20 +64,23 @@ def test_two_cameras_overlays_are_large_within_their_card_and_cover_no_word(
 ) -> None:
     tab = opened[0]
     tab.set_viewport_size({"width": width, "height": height})
-    tab.wait_for_timeout(800)
     overlays = [f"div:has(> .overlay-{n}) + div img" for n in (1, 2)]
-    card, first, second, words, why = boxes(
-        tab, "#op-scene", *overlays, "#op-scene p:first-of-type", "#op-scene p.why"
-    )  # fmt: skip
-    for box in (first, second):
-        assert box[3] - box[1] >= tile and box[2] - box[0] >= 2 * tile
-        assert card[0] < box[0] and box[2] <= card[2] and words[3] <= box[1] and box[3] <= why[1]
-    apart = [*boxes(tab, ".far-tabs", "#op-plan"), card, *boxes(tab, "#op-stop", "#op-adapt", "#op-loop")]
-    for i, a in enumerate(apart):
-        assert -1 <= a[0] < a[2] <= width + 1 and -1 <= a[1] < a[3] <= height + 1
-        for b in apart[i + 1 :]:
-            assert min(a[2], b[2]) - max(a[0], b[0]) <= 1 or min(a[3], b[3]) - max(a[1], b[1]) <= 1, (a, b)
-    assert first[2] <= second[0] or first[3] <= second[1]
+
+    def all_within_and_apart() -> None:
+        card, first, second, words, why = boxes(
+            tab, "#op-scene", *overlays, "#op-scene p:first-of-type", "#op-scene p.why"
+        )  # fmt: skip
+        for box in (first, second):
+            assert box[3] - box[1] >= tile and box[2] - box[0] >= 2 * tile
+            assert card[0] < box[0] and box[2] <= card[2] and words[3] <= box[1] and box[3] <= why[1]
+        apart = [*boxes(tab, ".far-tabs", "#op-plan"), card, *boxes(tab, "#op-stop", "#op-adapt", "#op-loop")]
+        for i, a in enumerate(apart):
+            assert -1 <= a[0] < a[2] <= width + 1 and -1 <= a[1] < a[3] <= height + 1
+            for b in apart[i + 1 :]:
+                assert min(a[2], b[2]) - max(a[0], b[0]) <= 1 or min(a[3], b[3]) - max(a[1], b[1]) <= 1, (a, b)
+        assert first[2] <= second[0] or first[3] <= second[1]
+
+    settles(all_within_and_apart)
 
 
 def test_an_open_panel_lies_over_the_scene_and_the_plots_come_back_with_the_attempt(opened: tuple[Any, Stage]) -> None:
@@ -86,17 +89,21 @@ def test_an_open_panel_lies_over_the_scene_and_the_plots_come_back_with_the_atte
     plots = "getComputedStyle(document.querySelector('div:has(> .mark-value) + div')).visibility"
     assert tab.evaluate(plots) == "hidden"
     tab.click("#far-tab-marks summary")
-    tab.wait_for_timeout(300)
-    covered = tab.evaluate(
-        """() => { const card = document.querySelector('#op-marks').getBoundingClientRect();
-            return [...document.querySelectorAll('button.mantine-Button-root')].filter(b => {
-              const r = b.getBoundingClientRect();
-              const within = r.width > 0 && r.left >= card.left && r.right <= card.right && r.top >= card.top
-                && r.bottom <= card.bottom;
-              return within && !b.contains(document.elementFromPoint(r.left + r.width / 2, r.top + r.height / 2));
-            }).map(b => b.innerText); }"""
-    )
-    assert covered == []
+    tab.wait_for_selector("#op-marks", state="visible")
+
+    def nothing_covered() -> None:
+        covered = tab.evaluate(
+            """() => { const card = document.querySelector('#op-marks').getBoundingClientRect();
+                return [...document.querySelectorAll('button.mantine-Button-root')].filter(b => {
+                  const r = b.getBoundingClientRect();
+                  const within = r.width > 0 && r.left >= card.left && r.right <= card.right && r.top >= card.top
+                    && r.bottom <= card.bottom;
+                  return within && !b.contains(document.elementFromPoint(r.left + r.width / 2, r.top + r.height / 2));
+                }).map(b => b.innerText); }"""
+        )
+        assert covered == []
+
+    settles(nothing_covered)
     tab.click("#far-tab-marks summary")
     source.telemetry = replace(running(), plan=PLAN)
     tab.wait_for_selector("#op-state[data-state='RUNNING']")

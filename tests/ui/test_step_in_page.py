@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from test_page import ARGUMENTS, CHROMIUM, button
 from test_panels import ATTEMPTS, ROWS
-from ui_process import PageProcess, free_port, wait_until
+from ui_process import PageProcess, free_port, settles, wait_until
 from ui_stage import Stage, running
 
 from far_app.lineage import Versions, VersionWish, Wish
@@ -202,19 +202,23 @@ def test_a_demonstration_that_waits_opens_its_panel(tab: Any, source: Stage) -> 
 @pytest.mark.parametrize("panel", ["steer", "marks", "versions"])
 def test_nothing_within_a_panel_is_covered_or_outside_of_it(tab: Any, panel: str) -> None:
     tab.click(f"#far-tab-{panel} summary")
-    tab.wait_for_timeout(300)
-    frame, boxes = tab.evaluate(
-        """name => { const r = e => { const b = e.getBoundingClientRect(); return [b.left, b.top, b.right, b.bottom]; };
-          const card = document.querySelector(`#op-${name}`);
-          const within = [...document.querySelectorAll('button.mantine-Button-root, .far-panel input')]
-            .filter(e => e.getBoundingClientRect().width > 0)
-            .concat([...card.querySelectorAll('p, table')])
-            .map(r).filter(b => b[0] >= r(card)[0] - 1 && b[0] < r(card)[2] && b[1] >= r(card)[1] && b[1] < r(card)[3]);
-          return [r(card), within]; }""", panel,
-    )  # fmt: skip
-    assert len(boxes) > 4
-    for box in boxes:
-        assert box[2] <= frame[2] + 1 and box[3] <= frame[3] + 1
-    for i, a in enumerate(boxes):
-        for b in boxes[i + 1 :]:
-            assert min(a[2], b[2]) - max(a[0], b[0]) <= 1 or min(a[3], b[3]) - max(a[1], b[1]) <= 1, (a, b)
+
+    def all_within_and_apart() -> None:
+        frame, boxes = tab.evaluate(
+            """name => {
+              const r = e => { const b = e.getBoundingClientRect(); return [b.left, b.top, b.right, b.bottom]; };
+              const card = document.querySelector(`#op-${name}`), [left, top, right, bottom] = r(card);
+              const within = [...document.querySelectorAll('button.mantine-Button-root, .far-panel input')]
+                .filter(e => e.getBoundingClientRect().width > 0)
+                .concat([...card.querySelectorAll('p, table')])
+                .map(r).filter(b => b[0] >= left - 1 && b[0] < right && b[1] >= top && b[1] < bottom);
+              return [r(card), within]; }""", panel,
+        )  # fmt: skip
+        assert len(boxes) > 4
+        for box in boxes:
+            assert box[2] <= frame[2] + 1 and box[3] <= frame[3] + 1
+        for i, a in enumerate(boxes):
+            for b in boxes[i + 1 :]:
+                assert min(a[2], b[2]) - max(a[0], b[0]) <= 1 or min(a[3], b[3]) - max(a[1], b[1]) <= 1, (a, b)
+
+    settles(all_within_and_apart)

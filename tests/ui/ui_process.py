@@ -52,3 +52,17 @@ def wait_until(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
             return True
         time.sleep(0.02)
     return condition()
+
+
+def settles(check: Callable[[], None], seconds: float = 15.0) -> None:
+    """A check of what a page shows passes in the end: labels and layout come in several messages."""
+
+    def passes() -> bool:
+        try:
+            check()
+        except AssertionError:
+            return False
+        return True
+
+    if not wait_until(passes, seconds):
+        check()
