@@ -26,7 +26,8 @@ def check(cancelled: Cancelled) -> None:
 
 def abandonable(call: Callable[[], T], cancelled: Cancelled) -> T:
     """The result of a call that cannot look for itself (a compiler's); when the adaptation is no longer wanted it is
-    left to end alone, in its own thread, and its result is dropped."""
+    left to end alone, in its own thread, and its result is dropped. The program's end waits for it: a thread inside a
+    compiler or torch at the interpreter's end would abort it."""
     result: Future[T] = Future()
 
     def work() -> None:
@@ -35,7 +36,7 @@ def abandonable(call: Callable[[], T], cancelled: Cancelled) -> T:
         except BaseException as error:
             result.set_exception(error)
 
-    threading.Thread(target=work, name="adaptation-engine", daemon=True).start()
+    threading.Thread(target=work, name="adaptation-engine").start()
     while not wait((result,), timeout=_LOOK).done:
         check(cancelled)
     return result.result()
