@@ -28,6 +28,9 @@ needs_openvino = pytest.mark.skipif(not available(), reason="OpenVINO is not ins
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA GPU here")
 HISTORY = tuple(s.observation for s in small_attempt(2).steps)
 NOISE = np.random.default_rng(0).standard_normal((1, 8, 7)).astype(np.float32)
+ROUNDING = 1e-5
+"""By which features of values up to 1 differ where a processor takes other kernels for another batch size (without
+AVX-512: 1.2e-6)."""
 
 
 def policy(encoder: str = "light", seed: int = 0, norm: str = "group", n_obs: int = 2) -> DiffusionPolicy:
@@ -78,11 +81,11 @@ def test_an_engine_is_the_reference_alone_in_a_batch_and_pushed(name, encoder, n
         histories, noise = probe(network, batch)
         expected, chunks = reference.plan(histories, noise)
         found = engine.plan(histories, noise)
-        assert torch.allclose(found[0], expected, atol=max(entry.tolerance, 1e-6))
-        assert torch.allclose(found[1], chunks, atol=max(entry.tolerance, 1e-6))
-        assert torch.allclose(engine.encode(histories), expected, atol=max(entry.tolerance, 1e-6))
+        assert torch.allclose(found[0], expected, atol=max(entry.tolerance, ROUNDING))
+        assert torch.allclose(found[1], chunks, atol=max(entry.tolerance, ROUNDING))
+        assert torch.allclose(engine.encode(histories), expected, atol=max(entry.tolerance, ROUNDING))
         pushed = [e.sample(expected, noise, push=lambda clean: clean + 0.3) for e in (engine, reference)]
-        assert torch.allclose(*pushed, atol=max(entry.tolerance, 1e-6))
+        assert torch.allclose(*pushed, atol=max(entry.tolerance, ROUNDING))
         assert not torch.allclose(pushed[1], chunks, atol=1e-2)
 
 
@@ -102,7 +105,7 @@ def test_the_cuda_program_run_eagerly_is_the_reference(encoder, dtype, tolerance
     check(engine.adapted(other, "v2"), ReferenceEngine(other, "v2"), tolerance, denoiser_only=True)
     check(engine, reference, tolerance)
     histories = probe(network, 5)[0]
-    assert torch.allclose(engine.another_encoder()(histories), engine.encode(histories), atol=1e-6)
+    assert torch.allclose(engine.another_encoder()(histories), engine.encode(histories), atol=ROUNDING)
 
 
 @pytest.mark.parametrize("encoder", ["light", "resnet18", "none"])
@@ -111,7 +114,7 @@ def test_learning_sees_what_the_policy_sees_while_it_acts(name, encoder):
     network, entry = policy(encoder), ENGINES[name]
     if why := entry.unusable(network):
         pytest.skip(f"{name}: {why}")
-    engine, tolerance = entry.make(network, "v", False), max(entry.tolerance, 1e-6)
+    engine, tolerance = entry.make(network, "v", False), max(entry.tolerance, ROUNDING)
     learners = engine.another_encoder()
     seen, acted = probe(network, 12)[0], probe(network, 24)[0][12:]
     noise = torch.zeros(1, 8, 7)
@@ -172,7 +175,7 @@ def test_after_an_adaptation_each_version_runs_its_own_weights(name, seed, batch
     """Graphs are shared by all weights of an architecture; each engine reads its own."""
     base = policy(seed=seed % 3)
     torch.manual_seed(seed)
-    other, tolerance = moved(base), max(ENGINES[name].tolerance, 1e-6)
+    other, tolerance = moved(base), max(ENGINES[name].tolerance, ROUNDING)
     before = ENGINES[name].make(base, "base", False)
     after = before.adapted(other, "base+a1")
     features, noise = torch.randn(batch, base.feature_dim), torch.randn(batch, 8, 7)
