@@ -25,6 +25,7 @@ import zmq
 
 from far_app.endpoints import Endpoints
 from far_app.errors import FarError
+from far_app.parent import die_with_parent
 from far_app.recording.attempt_reader import read_attempt
 from far_app.recording.replay import LOOPBACK
 from far_app.recording.scan import ends_in_order
@@ -32,7 +33,6 @@ from far_app.signal_event import SignalSafeEvent
 from far_app.telemetry import Telemetry
 from ui.access import Access
 from ui.feeds import Latest
-from ui.parent import die_with_parent
 from ui.rerun_views import (
     ACTIONS,
     APPLICATION,

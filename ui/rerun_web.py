@@ -24,9 +24,9 @@ from typing import Any
 from urllib.parse import quote
 
 from far_app.errors import FarError
+from far_app.parent import killed_with_parent
 from far_app.recording.replay import LOOPBACK, quiet_configuration, viewer_command
 from ui.access import Access
-from ui.parent import killed_with_parent
 
 FILES = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico", "sw.js")
 PATIENCE = 60.0

@@ -20,6 +20,7 @@ from typing import Any
 from far_app.endpoints import Endpoints
 from far_app.lineage import VersionWish
 from far_app.marks import MarkAttempt
+from far_app.parent import die_with_parent, run_until_told
 from far_app.recording.said_lines import now
 from far_app.session_states import Intent
 from far_app.signal_event import SignalSafeEvent
@@ -31,7 +32,6 @@ from ui.feeds import Feeds
 from ui.live_viewer import LiveViewer
 from ui.live_why import LiveWhy
 from ui.page_server import open_page
-from ui.parent import die_with_parent, run_until_told
 from ui.presence import Presence
 from ui.stop import StopLine, hasten
 from ui.view_model import Freshness

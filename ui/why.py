@@ -15,8 +15,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from far_app.parent import die_with_parent, run_until_told
 from far_app.signal_event import SignalSafeEvent
-from ui.parent import die_with_parent, run_until_told
 from ui.why_view import View, WhyOptions
 
 log = logging.getLogger(__name__)

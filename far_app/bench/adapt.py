@@ -62,6 +62,8 @@ class AdaptOptions:
     seed: int = 0
     torch_threads: int = 1
     learning_threads: int = field(default_factory=learning_threads)
+    learning_apart: bool = True
+    """In a process of its own, as `far run` does; the plain form is made in the loop's."""
     attempt_seconds: float = 20.0
     """How long to run trials first, to see one fail."""
     growth: str = "quickstart"
@@ -103,7 +105,7 @@ def measure(options: AdaptOptions) -> dict[str, Any]:
         run = RunOptions(
             seed=options.seed, policy=options.policy, critic=options.critic, method="far", headless=True, rerun=False,
             torch_threads=options.torch_threads, learning_threads=options.learning_threads,
-            recordings=Path(recordings), max_attempts=ATTEMPTS, trials=1000,
+            learning_apart=options.learning_apart, recordings=Path(recordings), max_attempts=ATTEMPTS, trials=1000,
             retry=replace(recommended(RunOptions.task, options.policy), adaptation_limit=PATIENCE),
         )  # fmt: skip
         with stage(run) as stage_:
@@ -192,6 +194,7 @@ def learning(method: Method) -> RetryMethod:
 def plainly(method: RetryMethod) -> RetryMethod:
     """The same method, its networks run as they are written, on one thread."""
     from far_app.learning.trainable import plain
+    from far_app.learning.work.here import WorkHere
 
-    method.arrange, method.encode, method.threads = plain, method.base.encode, 1
+    method.work, method.encode = WorkHere(arrange=plain), method.base.encode
     return method

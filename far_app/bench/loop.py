@@ -61,6 +61,8 @@ class LoopOptions:
     port: int = 0
     """The page's port; 0 takes a free one."""
     torch_threads: int = 1
+    learning_apart: bool = True
+    """Learn in a process of its own, as `far run` does."""
     page: bool = True
     """Run the page and its client too."""
 
@@ -83,7 +85,8 @@ def measure(options: LoopOptions) -> dict[str, Any]:
         run = RunOptions(
             seed=options.seed, policy=options.policy, critic=options.critic, port=options.port, method="far",
             engine=options.engine,
-            headless=not options.page, rerun=False, torch_threads=options.torch_threads, recordings=Path(recordings),
+            headless=not options.page, rerun=False, torch_threads=options.torch_threads,
+            learning_apart=options.learning_apart, recordings=Path(recordings),
             retry=recommended(RunOptions.task, options.policy), **there,
         )  # fmt: skip
         with stage(run) as stage_, client(stage_.page_url, options.seconds) as connected:

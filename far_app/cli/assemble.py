@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from far_app.learning.policy import DiffusionPolicy
     from far_app.learning.runtime import ActingPolicy
     from far_app.learning.steering import Steering
+    from far_app.learning.work.protocol import Work
     from far_app.methods.retry import Act
 
 UNTRAINED = "untrained:"
@@ -84,10 +85,10 @@ def assemble(
     engine: str = "auto",
     lanes: int | None = None,
     threads: int = 1,
-    learning_threads: int = 1,
+    work: Callable[[], Work] | None = None,
 ) -> Parts:
     """Load what a method needs and warm it up; `lanes`: trials that will share the base policy's batches; `threads`: of
-    one torch operation; `learning_threads`: that learn from a failure at once. Raises ConfigError or
+    one torch operation; `work`: where a method that learns does so, on a CPU. Raises ConfigError or
     CheckpointError."""
     if policy is not None and policy.startswith("test:"):
         from far_app.cli._scripted import ScriptedMethod
@@ -97,7 +98,7 @@ def assemble(
             method=scripted, policy_name=policy, max_attempts=None, checkpoint=policy, another=lambda: scripted
         )
     model = load_model(policy, critic, task.name, device, [method], engine, lanes, threads)
-    return equip(model, method, retry, learning_threads)
+    return equip(model, method, retry, work)
 
 
 def check_methods(methods: Sequence[str]) -> None:
@@ -158,10 +159,11 @@ def engine_choice(engine: str, network: DiffusionPolicy, lanes: int | None, thre
     return fastest(network, threads) if engine == "auto" and lanes is None else order_of(engine, network)
 
 
-def equip(model: Model, method: str, retry: RetryConfig, learning_threads: int = 1) -> Parts:
-    """One method of a loaded model, with its settings, learning on so many threads. Raises ConfigError or
-    CheckpointError."""
+def equip(model: Model, method: str, retry: RetryConfig, work: Callable[[], Work] | None = None) -> Parts:
+    """One method of a loaded model, with its settings; on a CPU it learns where `work` says, else here on one thread.
+    Raises ConfigError or CheckpointError."""
     from far_app.learning.critic_file import load_demonstrations
+    from far_app.learning.work.here import WorkHere
     from far_app.methods import METHODS, Ingredients
     from far_app.methods import method as make_method
 
@@ -173,7 +175,7 @@ def equip(model: Model, method: str, retry: RetryConfig, learning_threads: int =
     on_cpu = model.network.normalizer.low.device.type == "cpu"
     ingredients = Ingredients(
         network=model.network, critic=model.critic, config=retry, demonstrations=demonstrations, act=model.act,
-        memory=model.memory, encoder=model.base.another_encoder, threads=learning_threads if on_cpu else 1,
+        memory=model.memory, encoder=model.base.another_encoder, work=work if work is not None and on_cpu else WorkHere,
     )  # fmt: skip
     return Parts(
         method=make_method(method, ingredients), policy_name=model.name, max_attempts=entry.attempts,

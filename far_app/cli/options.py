@@ -73,6 +73,8 @@ class RunOptions:
     """Threads of one torch operation in the loop's process."""
     learning_threads: int = field(default_factory=learning_threads)
     """Threads that learn from a failure at once; by default one for each core, up to four."""
+    learning_apart: bool = True
+    """On a CPU, learn in a process of its own, in which nobody waits for the control loop nor the loop for it."""
     settings: Settings = "model"
     """Begin from what the checkpoint's makers recommend (the retry.toml beside it), or from the paper's settings."""
     retry: RetryConfig = field(default_factory=RetryConfig)

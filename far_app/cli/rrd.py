@@ -14,9 +14,9 @@ import sys
 from pathlib import Path
 
 from far_app.errors import RecordingError
+from far_app.parent import die_with_parent
 from far_app.recording.replay import lacking_rrd, make_rrd
 from far_app.signal_event import SignalSafeEvent
-from ui.parent import die_with_parent
 
 log = logging.getLogger(__name__)
 

@@ -1,5 +1,5 @@
-"""The two processes beside the application, or one where another machine drives the arm: the hw server and the page.
-How they are started, waited for, and the page revived.
+"""The processes beside the application: the hw server (unless another machine drives the arm), the page, and the one
+that learns. How they are started, waited for, and the page revived.
 
 Called by stage.py.
 """
@@ -7,12 +7,14 @@ Called by stage.py.
 from __future__ import annotations
 
 import contextlib
+import functools
 import http.client
 import os
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from far_app.cli.agreement import agreed
 from far_app.cli.options import RunOptions
@@ -23,6 +25,9 @@ from far_app.link import RemoteRobot
 from far_app.scheduling import nice
 from far_app.station import station_at
 from hw.rig import RigConfig
+
+if TYPE_CHECKING:
+    from far_app.learning.work.protocol import Work
 
 HARDWARE_PATIENCE = 180.0
 """Seconds for the hw server's first observation (a first start compiles for a while)."""
@@ -56,6 +61,29 @@ def start_page(folder: Path, options: RunOptions, port: int, cameras: Sequence[s
     arguments += ["--operator", options.operator]
     arguments += ["--no-scene3d"] * (not options.scene3d) + ["--no-rerun"] * (not options.rerun)
     return Child("page", "ui.server", arguments, folder)
+
+
+@contextlib.contextmanager
+def learning(folder: Path, family: Family, options: RunOptions) -> Iterator[Callable[[], Work]]:
+    """Where methods learn: in a process of its own, which is started with the first that asks, or in this one."""
+    with contextlib.ExitStack() as stack:
+
+        @functools.cache
+        def work() -> Work:
+            from far_app.learning.work.here import WorkHere
+            from far_app.learning.work.process import WorkProcess
+
+            here = WorkHere(options.learning_threads)
+            if not options.learning_apart:
+                return here
+            arguments = ["--folder", str(folder), "--threads", str(options.learning_threads)]
+            arguments += ["--torch-threads", str(options.torch_threads)]
+            child = family.add(Child("learning", "far_app.learning.work.server", arguments, folder))
+            process = WorkProcess(folder, lambda: None if child.alive() else child.last_words(), here)
+            stack.callback(process.close)
+            return process
+
+        yield work
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from far_app.cli._person import person_parts
 from far_app.cli.assemble import Parts, assemble, check_observation
@@ -21,7 +21,7 @@ from far_app.cli.options import RunOptions
 from far_app.cli.ports import choose_port
 from far_app.cli.preflight import policy_card, preflight
 from far_app.cli.processes import Child, Family, run_folder
-from far_app.cli.servers import connected, find_hardware, revived, start_page, wait_for_page
+from far_app.cli.servers import connected, find_hardware, learning, revived, start_page, wait_for_page
 from far_app.config import TaskConfig
 from far_app.detectors import PersonJudge, TwinCheck
 from far_app.endpoints import Endpoints
@@ -48,6 +48,9 @@ from hw.camera_config import with_views
 from hw.rig import RigConfig
 from hw.setup import setup_of
 from ui.access import Access
+
+if TYPE_CHECKING:
+    from far_app.learning.work.protocol import Work
 
 COUNTDOWN = 3.0
 """Seconds for which a real arm's attempts are announced."""
@@ -151,14 +154,14 @@ class Stage:
                 publisher.close()
 
 
-Assembling = Callable[[RunOptions, TaskConfig], Mapping[str, Parts]]
+Assembling = Callable[[RunOptions, TaskConfig, "Callable[[], Work]"], Mapping[str, Parts]]
 
 
-def one_method(options: RunOptions, task: TaskConfig) -> Mapping[str, Parts]:
+def one_method(options: RunOptions, task: TaskConfig, work: Callable[[], Work]) -> Mapping[str, Parts]:
     """What the options themselves ask for."""
     parts = assemble(
         options.method, task, options.policy, options.critic, options.device, options.retry, options.engine,
-        threads=options.torch_threads, learning_threads=options.learning_threads,
+        threads=options.torch_threads, work=work,
     )  # fmt: skip
     return {options.method: parts}
 
@@ -177,7 +180,8 @@ def stage(options: RunOptions, assembling: Assembling = one_method, *, person: b
         stack.callback(family.end)
         hardware, rig = find_hardware(folder, family, options, rig)
         page = None if options.headless else family.add(start_page(folder, options, port, task.cameras))
-        methods = {"": person_parts(task, rig.policy_image)} if person else assembling(options, task)
+        work = stack.enter_context(learning(folder, family, options))
+        methods = {"": person_parts(task, rig.policy_image)} if person else assembling(options, task, work)
         parts = next(iter(methods.values()))
         attempts = options.max_attempts or parts.max_attempts or task.max_attempts
         task = dataclasses.replace(task, max_attempts=1 if options.shadow else attempts)

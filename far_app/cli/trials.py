@@ -4,11 +4,12 @@ interrupted."""
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -28,6 +29,9 @@ from far_app.trial_plan.read import read_plan
 from far_app.trial_plan.scene_gate import References
 from far_app.trial_plan.shown import PlanShown
 from far_app.trial_plan.telling import Teller, lines
+
+if TYPE_CHECKING:
+    from far_app.learning.work.protocol import Work
 
 Ours = tyro.conf.Suppress
 """The plan says it, not the command line."""
@@ -101,7 +105,9 @@ def attempts(parts: Parts, options: RunOptions, task: TaskConfig) -> int:
     return parts.max_attempts or options.max_attempts or task.max_attempts
 
 
-def assembled(plan: TrialPlan, options: RunOptions, task: TaskConfig) -> Mapping[str, Parts]:
+def assembled(
+    plan: TrialPlan, options: RunOptions, task: TaskConfig, work: Callable[[], Work]
+) -> Mapping[str, Parts]:  # fmt: skip
     """Every method of the plan; a model that several share is loaded once. Raises ConfigError and CheckpointError."""
     parts: dict[str, Parts] = {}
     models = {}
@@ -116,13 +122,13 @@ def assembled(plan: TrialPlan, options: RunOptions, task: TaskConfig) -> Mapping
             models[key] = load_model(
                 *key, task.name, options.device, sharing, options.engine, threads=options.torch_threads
             )
-        parts[method.name] = equip(models[key], method.method, retry, options.learning_threads)
+        parts[method.name] = equip(models[key], method.method, retry, work)
     return parts
 
 
 def run(plan: TrialPlan, options: TrialsOptions, earlier: Sequence[SessionRecording], references: References) -> None:
     """What is left of the plan, as one session. Raises the FarError that ended it."""
-    with Ending() as ending, stage(options, lambda o, task: assembled(plan, o, task)) as stage_:
+    with Ending() as ending, stage(options, functools.partial(assembled, plan)) as stage_:
         writer = stage_.writer(plan)
         course = PlanCourse(
             plan, equipped(stage_), earlier=earlier, folder=writer.folder, references=references, tell=tell

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from far_app.wire import register
 
 
 class StepEmbedding(nn.Module):
@@ -53,6 +56,19 @@ class ResidualBlock(nn.Module):
         return self.second(self.first(x) * scale + shift) + self.skip(x)
 
 
+@register
+@dataclass(frozen=True, kw_only=True)
+class UnetSizes:
+    """What a ConditionalUnet1d is made with."""
+
+    action_dim: int
+    features: int
+    widths: tuple[int, ...]
+    kernel: int
+    step_dim: int
+    groups: int
+
+
 class ConditionalUnet1d(nn.Module):
     """ε_θ(a_k, s, k): the noise in a noisy chunk, given the observation's features."""
 
@@ -61,11 +77,15 @@ class ConditionalUnet1d(nn.Module):
         step_dim: int = 16, groups: int = 8,
     ) -> None:  # fmt: skip
         super().__init__()
+        self.sizes = UnetSizes(
+            action_dim=action_dim, features=features, widths=tuple(widths), kernel=kernel, step_dim=step_dim,
+            groups=groups,
+        )  # fmt: skip
         self.step_embedding = StepEmbedding(step_dim)
         condition = step_dim + features
-        sizes = [action_dim, *widths]
+        channels = [action_dim, *widths]
         self.downs = nn.ModuleList()
-        for i, (inner, outer) in enumerate(itertools.pairwise(sizes)):
+        for i, (inner, outer) in enumerate(itertools.pairwise(channels)):
             last = i == len(widths) - 1
             self.downs.append(nn.ModuleList([
                 ResidualBlock(inner, outer, condition, kernel, groups),

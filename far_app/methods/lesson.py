@@ -12,19 +12,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from far_app.config import RetryConfig
 from far_app.errors import FarError
-from far_app.learning import diffusion, fcpa
 from far_app.learning.cancellation import Cancelled, check
 from far_app.learning.critic import Critic
 from far_app.learning.memory import Encode, FeatureMemory
-from far_app.learning.pairs import Pairs, candidates, explored, merged, select, weighted_trajectory
+from far_app.learning.pairs import Pairs, explored, merged, select, weighted_trajectory
 from far_app.learning.policy import DiffusionPolicy
-from far_app.learning.preference import Demonstrations, Noising
-from far_app.learning.threads import Each, on_threads
-from far_app.learning.trainable import Arrange
+from far_app.learning.preference import Demonstrations
+from far_app.learning.work.protocol import Work
 from far_app.methods import evidence
 from far_app.methods.evidence import sent_chunks
 from far_app.protocols import PolicySpec, Progress
@@ -47,9 +45,7 @@ class Learner:
     encode: Encode
     """How the policy sees."""
     demonstrations: Demonstrations | None
-    arrange: Arrange
-    threads: int
-    """That learn at once."""
+    work: Work
     rounds: Sequence[Pairs]
     """Of the trial's earlier lessons, where an update starts from the base with all of them."""
 
@@ -85,14 +81,10 @@ class Lesson:
 
     def run(self, progress: Progress) -> tuple[nn.Module | None, Pairs]:
         """The adapted denoiser (None when nothing changed) and the pairs it learnt from."""
-        with on_threads(self.learner.threads) as each:
-            return self._run(progress, each)
-
-    def _run(self, progress: Progress, each: Each) -> tuple[nn.Module | None, Pairs]:
         learner, config = self.learner, self.learner.config
         eyes = self.attribute(progress)
         awr = config.fcpa.objective == "awr"
-        pairs = self._trajectory(eyes) if awr else self._pairs(eyes, self.adaptation.flagged, each)
+        pairs = self._trajectory(eyes) if awr else self._pairs(eyes, self.adaptation.flagged)
         self.note("pairs", pairs=len(pairs), empty_states=pairs.empty_states)
         progress(self.adaptation)
         if not len(pairs):
@@ -102,17 +94,16 @@ class Lesson:
         check(self.cancelled)
         accumulate = config.fcpa.accumulate
         denoiser = copy.deepcopy((learner.acting if accumulate else learner.base).denoiser).requires_grad_(True).eval()
-        update = fcpa.adapt(
-            denoiser, Noising(add_noise=diffusion.add_noise, steps=diffusion.TRAIN_STEPS),
-            pairs if accumulate else merged([*learner.rounds, pairs]), config.fcpa, self._rng("fcpa"), self.cancelled,
+        update = learner.work.update(
+            denoiser, pairs if accumulate else merged([*learner.rounds, pairs]), config.fcpa,
+            (self.attempt.scene_seed, self.attempt.index), self.cancelled,
             lambda step: (self.history.append(step), progress(step))[1], learner.demonstrations,
-            learner.arrange, each,
         )  # fmt: skip
         denoiser.requires_grad_(False)
         self.note("update", status=update.status, history=update.history, note=update.note)
         return (denoiser if update.changed else None), pairs
 
-    def _pairs(self, eyes: evidence.Eyes, ticks: tuple[int, ...], each: Each) -> Pairs:
+    def _pairs(self, eyes: evidence.Eyes, ticks: tuple[int, ...]) -> Pairs:
         """Candidates under the policy that acted, filtered and ranked, for every flagged chunk."""
         learner, config, critic = self.learner, self.learner.config.pairs, eyes.critic
         spec = learner.spec
@@ -123,18 +114,11 @@ class Lesson:
         noise = [self._rng("candidates", t).standard_normal(shape, dtype=np.float32) for t in ticks]
         self.note("encoding")
 
-        runner = learner.arrange(learner.acting.denoiser, spec.horizon, train=False)
-
-        def denoiser(noisy: Tensor, k: Tensor, condition: Tensor) -> Tensor:
-            check(self.cancelled)
-            return runner.run(noisy, k, condition)
-
-        def sample(condition: Tensor, start: Tensor) -> Tensor:
-            return diffusion.ddim_sample(denoiser, condition, start, learner.base.config.ddim_steps)
-
         with torch.no_grad():
             stacked = torch.from_numpy(np.stack(noise)) if noise else torch.zeros(0, *shape)
-            chunks = candidates(sample, runner.condition(seen), stacked.to(seen.device), self.cancelled, each)
+            chunks = learner.work.candidates(
+                learner.acting.denoiser, learner.base.config.ddim_steps, seen, stacked.to(seen.device), self.cancelled
+            )
             if not bool(torch.isfinite(chunks).all()):
                 raise FarError(f"the policy {learner.version} sampled a non-finite candidate; nothing was learnt")
             if config.explore > 0:

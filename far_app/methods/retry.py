@@ -26,7 +26,8 @@ from far_app.learning.pairs import Pairs
 from far_app.learning.policy import DiffusionPolicy, fingerprint
 from far_app.learning.preference import Demonstrations
 from far_app.learning.steering import Steering
-from far_app.learning.trainable import Arrange, trainable
+from far_app.learning.work.here import WorkHere
+from far_app.learning.work.protocol import Work
 from far_app.methods import evidence
 from far_app.methods.lesson import Learner, Lesson
 from far_app.perturbation import Perturbation, perturbation
@@ -58,10 +59,8 @@ class Ingredients:
     """What the acting policies have seen; shared with them, so that nothing is encoded twice."""
     encoder: Callable[[], Encode] | None = None
     """Makes what learning sees with where nobody saw before: the policy's encoder in a faster form, for one thread."""
-    arrange: Arrange = trainable
-    """How the denoiser is run for candidates and the update; `plain` to compare with."""
-    threads: int = 1
-    """That learn at once, on a CPU; what is learnt does not depend on it."""
+    work: Callable[[], Work] = WorkHere
+    """Who makes candidates and updates; what is learnt does not depend on it. Asked for by a method that learns."""
 
     def seeing(self) -> Encode:
         """How a lesson sees; for one thread."""
@@ -81,7 +80,7 @@ class RetryMethod:
         self.critic = ingredients.critic
         self.memory = ingredients.memory
         self._seeing = ingredients.seeing
-        self.arrange, self.threads = ingredients.arrange, ingredients.threads
+        self.work = ingredients.work() if adapts else WorkHere()
         self.config = ingredients.config
         self.demonstrations = ingredients.demonstrations
         self.perturbation = self.config.perturbation
@@ -160,7 +159,7 @@ class RetryMethod:
         return Learner(
             spec=self.policy.spec, version=self.policy.version, acting=self.acting, base=self.base,
             critic=self.critic, config=self.config, memory=self.memory, encode=self.encode,
-            demonstrations=self.demonstrations, arrange=self.arrange, threads=self.threads, rounds=self.rounds,
+            demonstrations=self.demonstrations, work=self.work, rounds=self.rounds,
         )  # fmt: skip
 
     def _restore(self) -> None:

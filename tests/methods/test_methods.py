@@ -13,6 +13,7 @@ from far_app.config import AttributionConfig, FCPAConfig, PairsConfig, Perturbat
 from far_app.errors import ConfigError
 from far_app.learning.runtime import ActingPolicy
 from far_app.learning.trainable import plain, trainable
+from far_app.learning.work.here import WorkHere
 from far_app.methods import METHODS, Ingredients, method
 from far_app.methods.evidence import sent_chunks
 from far_app.protocols import Method
@@ -28,7 +29,7 @@ def test_a_lesson_is_the_same_on_any_number_of_threads(guard):
 
     def learnt(threads: int) -> tuple[list[bytes], tuple]:
         m = made("fcpa", config, small_policy())
-        m.threads = threads
+        m.work = WorkHere(threads)
         lesson = adapt(m)
         assert lesson.status == "adapted"
         assert threading.active_count() == before
@@ -162,7 +163,7 @@ def test_the_plain_form_teaches_the_same_lesson():
         network = small_policy()
         critic = small_critic(network)
         m = method("fcpa", Ingredients(
-            network=network, critic=critic, config=config, arrange=arrange,
+            network=network, critic=critic, config=config, work=lambda arrange=arrange: WorkHere(arrange=arrange),
             act=lambda net, version, steering=None: ActingPolicy(net, version, None, "torch", steering),
         ))  # fmt: skip
         lessons.append((adapt(m), plan(m)))

@@ -1,4 +1,4 @@
-"""How a process of the page runs: to its parent's end and no longer, or until it is told."""
+"""How a process of a run runs: to its parent's end and no longer, or until it is told."""
 
 from __future__ import annotations
 
