@@ -1,8 +1,8 @@
 """The run's other processes: started together, watched, ended together. No orphan, whatever ends us.
 
-A child ends by itself when we die, even by SIGKILL (hw.server and ui.server ask Linux for SIGTERM at their parent's
-death, and look at their parent's id). It stands in a process group of its own, so that Ctrl-C reaches us alone and we
-end the children in order. Starting one uses vfork: a restart does not stall the loop.
+A child ends by itself when we die, even by SIGKILL (each asks Linux for SIGTERM at its parent's death, and looks at its
+parent's id). It stands in a process group of its own, so that Ctrl-C reaches us alone and we end the children in order.
+Starting one uses vfork: a restart does not stall the loop.
 """
 
 from __future__ import annotations
