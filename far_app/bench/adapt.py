@@ -193,8 +193,8 @@ def learning(method: Method) -> RetryMethod:
 
 def plainly(method: RetryMethod) -> RetryMethod:
     """The same method, its networks run as they are written, on one thread."""
+    from far_app.learning.apart.here import WorkHere
     from far_app.learning.trainable import plain
-    from far_app.learning.work.here import WorkHere
 
     method.work, method.encode = WorkHere(arrange=plain), method.base.encode
     return method

@@ -14,13 +14,13 @@ from far_app.protocols import OWN_STATE, Method, PolicySpec
 from far_app.types import Observation
 
 if TYPE_CHECKING:
+    from far_app.learning.apart.protocol import Work
     from far_app.learning.critic import Critic
     from far_app.learning.engines import Choice
     from far_app.learning.memory import FeatureMemory
     from far_app.learning.policy import DiffusionPolicy
     from far_app.learning.runtime import ActingPolicy
     from far_app.learning.steering import Steering
-    from far_app.learning.work.protocol import Work
     from far_app.methods.retry import Act
 
 UNTRAINED = "untrained:"
@@ -162,8 +162,8 @@ def engine_choice(engine: str, network: DiffusionPolicy, lanes: int | None, thre
 def equip(model: Model, method: str, retry: RetryConfig, work: Callable[[], Work] | None = None) -> Parts:
     """One method of a loaded model, with its settings; on a CPU it learns where `work` says, else here on one thread.
     Raises ConfigError or CheckpointError."""
+    from far_app.learning.apart.here import WorkHere
     from far_app.learning.critic_file import load_demonstrations
-    from far_app.learning.work.here import WorkHere
     from far_app.methods import METHODS, Ingredients
     from far_app.methods import method as make_method
 

@@ -27,7 +27,7 @@ from far_app.station import station_at
 from hw.rig import RigConfig
 
 if TYPE_CHECKING:
-    from far_app.learning.work.protocol import Work
+    from far_app.learning.apart.protocol import Work
 
 HARDWARE_PATIENCE = 180.0
 """Seconds for the hw server's first observation (a first start compiles for a while)."""
@@ -70,15 +70,15 @@ def learning(folder: Path, family: Family, options: RunOptions) -> Iterator[Call
 
         @functools.cache
         def work() -> Work:
-            from far_app.learning.work.here import WorkHere
-            from far_app.learning.work.process import WorkProcess
+            from far_app.learning.apart.here import WorkHere
+            from far_app.learning.apart.process import WorkProcess
 
             here = WorkHere(options.learning_threads)
             if not options.learning_apart:
                 return here
             arguments = ["--folder", str(folder), "--threads", str(options.learning_threads)]
             arguments += ["--torch-threads", str(options.torch_threads)]
-            child = family.add(Child("learning", "far_app.learning.work.server", arguments, folder))
+            child = family.add(Child("learning", "far_app.learning.apart.server", arguments, folder))
             process = WorkProcess(folder, lambda: None if child.alive() else child.last_words(), here)
             stack.callback(process.close)
             return process

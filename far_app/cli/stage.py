@@ -50,7 +50,7 @@ from hw.setup import setup_of
 from ui.access import Access
 
 if TYPE_CHECKING:
-    from far_app.learning.work.protocol import Work
+    from far_app.learning.apart.protocol import Work
 
 COUNTDOWN = 3.0
 """Seconds for which a real arm's attempts are announced."""

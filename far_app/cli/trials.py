@@ -31,7 +31,7 @@ from far_app.trial_plan.shown import PlanShown
 from far_app.trial_plan.telling import Teller, lines
 
 if TYPE_CHECKING:
-    from far_app.learning.work.protocol import Work
+    from far_app.learning.apart.protocol import Work
 
 Ours = tyro.conf.Suppress
 """The plan says it, not the command line."""

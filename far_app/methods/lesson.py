@@ -16,13 +16,13 @@ from torch import nn
 
 from far_app.config import RetryConfig
 from far_app.errors import FarError
+from far_app.learning.apart.protocol import Work
 from far_app.learning.cancellation import Cancelled, check
 from far_app.learning.critic import Critic
 from far_app.learning.memory import Encode, FeatureMemory
 from far_app.learning.pairs import Pairs, explored, merged, select, weighted_trajectory
 from far_app.learning.policy import DiffusionPolicy
 from far_app.learning.preference import Demonstrations
-from far_app.learning.work.protocol import Work
 from far_app.methods import evidence
 from far_app.methods.evidence import sent_chunks
 from far_app.protocols import PolicySpec, Progress

@@ -19,6 +19,8 @@ from far_app.config import RetryConfig
 from far_app.errors import ConfigError, FarError
 from far_app.learning import fcpa
 from far_app.learning.adapted import denoiser_of
+from far_app.learning.apart.here import WorkHere
+from far_app.learning.apart.protocol import Work
 from far_app.learning.cancellation import AdaptationCancelledError, Cancelled, abandonable, check
 from far_app.learning.critic import Critic
 from far_app.learning.memory import Encode, FeatureMemory
@@ -26,8 +28,6 @@ from far_app.learning.pairs import Pairs
 from far_app.learning.policy import DiffusionPolicy, fingerprint
 from far_app.learning.preference import Demonstrations
 from far_app.learning.steering import Steering
-from far_app.learning.work.here import WorkHere
-from far_app.learning.work.protocol import Work
 from far_app.methods import evidence
 from far_app.methods.lesson import Learner, Lesson
 from far_app.perturbation import Perturbation, perturbation

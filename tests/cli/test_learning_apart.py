@@ -9,10 +9,10 @@ import torch
 from far_app.cli.options import RunOptions
 from far_app.cli.processes import Family, run_folder
 from far_app.cli.servers import learning
+from far_app.learning.apart.here import WorkHere
+from far_app.learning.apart.process import WorkProcess
 from far_app.learning.cancellation import never
 from far_app.learning.unet import ConditionalUnet1d
-from far_app.learning.work.here import WorkHere
-from far_app.learning.work.process import WorkProcess
 
 OPTIONS = RunOptions(learning_threads=2)
 

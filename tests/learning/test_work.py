@@ -18,14 +18,14 @@ from torch import Tensor
 
 from far_app.config import FCPAConfig
 from far_app.errors import ConfigError, FarError
+from far_app.learning.apart.here import WorkHere
+from far_app.learning.apart.process import WorkProcess
+from far_app.learning.apart.protocol import Work
 from far_app.learning.cancellation import AdaptationCancelledError, Cancelled, never
 from far_app.learning.fcpa import Update
 from far_app.learning.pairs import Pairs
 from far_app.learning.preference import Demonstrations
 from far_app.learning.unet import ConditionalUnet1d
-from far_app.learning.work.here import WorkHere
-from far_app.learning.work.process import WorkProcess
-from far_app.learning.work.protocol import Work
 from far_app.types import AdaptationStep
 
 S, M, H, A, F = 3, 4, 8, 7, 20
@@ -36,7 +36,7 @@ class Apart:
     """A learning process and its work, as the application starts them."""
 
     def __init__(self, folder: Path) -> None:
-        command = [sys.executable, "-m", "far_app.learning.work.server", "--folder", str(folder), "--threads", "2"]
+        command = [sys.executable, "-m", "far_app.learning.apart.server", "--folder", str(folder), "--threads", "2"]
         self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         self.work = WorkProcess(folder, lambda: None if self.process.poll() is None else "killed", WorkHere())
 
@@ -130,7 +130,7 @@ def test_one_that_dies_fails_its_lesson_and_the_next_is_learnt_here(caplog):
 
 def test_it_ends_with_the_application():
     with TemporaryDirectory(prefix="far") as name:
-        command = [sys.executable, "-m", "far_app.learning.work.server", "--folder", name]
+        command = [sys.executable, "-m", "far_app.learning.apart.server", "--folder", name]
         code = f"import subprocess, time; print(subprocess.Popen({command!r}).pid, flush=True); time.sleep(60)"
         parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
         assert parent.stdout is not None

@@ -11,9 +11,9 @@ import torch
 
 from far_app.config import AttributionConfig, FCPAConfig, PairsConfig, PerturbationConfig, RetryConfig
 from far_app.errors import ConfigError
+from far_app.learning.apart.here import WorkHere
 from far_app.learning.runtime import ActingPolicy
 from far_app.learning.trainable import plain, trainable
-from far_app.learning.work.here import WorkHere
 from far_app.methods import METHODS, Ingredients, method
 from far_app.methods.evidence import sent_chunks
 from far_app.protocols import Method

@@ -12,12 +12,8 @@ from torch import Tensor
 
 from far_app.config import FCPAConfig
 from far_app.errors import FarError
-from far_app.learning.cancellation import AdaptationCancelledError
-from far_app.learning.pairs import Pairs
-from far_app.learning.preference import Demonstrations
-from far_app.learning.unet import ConditionalUnet1d, UnetSizes
-from far_app.learning.work.here import WorkHere
-from far_app.learning.work.messages import (
+from far_app.learning.apart.here import WorkHere
+from far_app.learning.apart.messages import (
     CandidatesAsked,
     CandidatesMade,
     Progressed,
@@ -28,6 +24,10 @@ from far_app.learning.work.messages import (
     send,
     weights_of,
 )
+from far_app.learning.cancellation import AdaptationCancelledError
+from far_app.learning.pairs import Pairs
+from far_app.learning.preference import Demonstrations
+from far_app.learning.unet import ConditionalUnet1d, UnetSizes
 
 log = logging.getLogger(__name__)
 

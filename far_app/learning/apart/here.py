@@ -10,13 +10,13 @@ from torch import Tensor, nn
 
 from far_app.config import FCPAConfig
 from far_app.learning import diffusion, fcpa
+from far_app.learning.apart.protocol import Key
 from far_app.learning.cancellation import Cancelled, check
 from far_app.learning.fcpa import Update
 from far_app.learning.pairs import Pairs, candidates
 from far_app.learning.preference import Demonstrations, Noising
 from far_app.learning.threads import on_threads
 from far_app.learning.trainable import Arrange, trainable
-from far_app.learning.work.protocol import Key
 from far_app.seeding import generator
 from far_app.types import AdaptationStep
 

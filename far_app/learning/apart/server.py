@@ -1,5 +1,5 @@
 """The learning process: makes candidates and updates for an application, one at a time, until it is told to end or the
-application is gone. `python -m far_app.learning.work.server --folder RUN --threads N --torch-threads M`
+application is gone. `python -m far_app.learning.apart.server --folder RUN --threads N --torch-threads M`
 
     main thread    hears what is asked, and what is asked no longer
     work           makes it (making.py), on threads of its own, and tells
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="far_app.learning.work.server")
+    parser = argparse.ArgumentParser(prog="far_app.learning.apart.server")
     parser.add_argument("--folder", type=Path, required=True, help="where the application is met")
     parser.add_argument("--threads", type=int, default=1, help="that compute at once")
     parser.add_argument("--torch-threads", type=int, default=1, help="of one torch operation")
@@ -47,8 +47,8 @@ def serve(options: argparse.Namespace, ended: SignalSafeEvent) -> None:
     gone = die_with_parent(signal.SIGTERM)
     import torch
 
-    from far_app.learning.work.making import Making
-    from far_app.learning.work.messages import NoLongerAsked, endpoints, receive
+    from far_app.learning.apart.making import Making
+    from far_app.learning.apart.messages import NoLongerAsked, endpoints, receive
 
     torch.set_num_threads(options.torch_threads)
     nice(BACKGROUND_NICENESS)

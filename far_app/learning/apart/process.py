@@ -16,12 +16,7 @@ from torch import Tensor, nn
 
 from far_app.config import FCPAConfig
 from far_app.errors import FarError
-from far_app.learning.cancellation import Cancelled, check
-from far_app.learning.fcpa import Update
-from far_app.learning.pairs import Pairs
-from far_app.learning.preference import Demonstrations
-from far_app.learning.unet import ConditionalUnet1d
-from far_app.learning.work.messages import (
+from far_app.learning.apart.messages import (
     CandidatesAsked,
     NoLongerAsked,
     Progressed,
@@ -34,7 +29,12 @@ from far_app.learning.work.messages import (
     send,
     weights_of,
 )
-from far_app.learning.work.protocol import Key, Work
+from far_app.learning.apart.protocol import Key, Work
+from far_app.learning.cancellation import Cancelled, check
+from far_app.learning.fcpa import Update
+from far_app.learning.pairs import Pairs
+from far_app.learning.preference import Demonstrations
+from far_app.learning.unet import ConditionalUnet1d
 from far_app.types import AdaptationStep
 
 log = logging.getLogger(__name__)
