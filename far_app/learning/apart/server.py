@@ -22,16 +22,12 @@ from far_app.signal_event import SignalSafeEvent
 
 log = logging.getLogger(__name__)
 
-LOADING_NICENESS = 10
-"""Until it is ready: the application comes up meanwhile, and needs it only after the first failure."""
 GONE_MS = 1000
 """After which an answer that nobody takes is dropped."""
 _POLL_MS = 200
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    if nice(BACKGROUND_NICENESS):  # permitted, and so is what takes the next line back
-        nice(LOADING_NICENESS)
     return run_until_told(options, serve, arguments)
 
 
